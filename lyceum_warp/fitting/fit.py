@@ -37,8 +37,10 @@ _USUAL = {
 }  # fmt: skip
 """Standard deviations of the noise of usual sensors, by kind of measurement."""
 _SHARE_OF_SIGNAL = 0.02
-_CONVERGED = 0.3
-"""A fit ends if its last steps leave no parameter uncertain by this multiple of its standard deviation."""
+_CONVERGED = 0.5
+"""A fit ends if a Gauss-Newton step is below this multiple of a standard deviation."""
+_BLOCK, _EVERY = 10, 4
+"""Windows of a block, and which blocks the first iterations use."""
 _KNOWN = 0.3
 """A parameter is determined if its posterior is narrower than this multiple of its prior."""
 _LARGE = 2.0
@@ -114,20 +116,25 @@ def fit(
     folder = None if out is None else Path(out)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
+    some = LeastSquares(problem.windows.chosen(np.arange(count) // _BLOCK % _EVERY == 0), predictor, groups)
+    current = some
     if resume and folder is not None and (folder / "estimate.npz").is_file():
-        at = _load(folder / "estimate.npz", problem)
+        at, current = _load(folder / "estimate.npz", [some, problem])
     else:
         start = np.zeros(bound.size)
         if samples:
-            some = np.unique(np.linspace(0, count - 1, 12).astype(int))
-            coarse = LeastSquares(problem.windows.chosen(some), predictor, {})
+            few = np.unique(np.linspace(0, count - 1, 12).astype(int))
+            coarse = LeastSquares(problem.windows.chosen(few), predictor, {})
             start = search(coarse, 5.0 * usual, max(8, samples), seed, lambda k, cost: report("search", k, cost))
-        at = problem.begin(start, usual)
-    while at.iteration < iterations and at.move >= _CONVERGED:
-        at = problem.iterate(at)
+        at = some.begin(start, usual)
+    while at.iteration < iterations and (current is some or at.move >= _CONVERGED):
+        at = current.iterate(at)
+        if current is some and at.move < _CONVERGED:
+            current = problem
+            at = dataclasses.replace(problem.begin(at.x, at.noise, at.spread), iteration=at.iteration)
         if folder is not None:
             with replaced(folder / "estimate.npz") as path, path.open("wb") as file:
-                np.savez(file, names=bound.names, begin=problem.windows.begin, **dataclasses.asdict(at))
+                np.savez(file, names=bound.names, begin=current.windows.begin, **dataclasses.asdict(at))
         report("fit", at.iteration, at.move)
     linear = problem.linearize(at)
     held = LeastSquares(windows.chosen(slice(count, None)), predictor, {}) if count < len(windows) else problem
@@ -260,12 +267,13 @@ def _write(
         path.write_text(json.dumps(content, indent=1))
 
 
-def _load(path: Path, problem: LeastSquares) -> Estimate:
-    """Read the estimate of an unfinished fit."""
+def _load(path: Path, problems: Sequence[LeastSquares]) -> tuple[Estimate, LeastSquares]:
+    """Read the estimate of an unfinished fit, and find its problem."""
     with np.load(path, allow_pickle=False) as file:
         arrays = dict(file)
-    if arrays.pop("names").tolist() != problem.parameters.names or not np.array_equal(
-        arrays.pop("begin"), problem.windows.begin
-    ):
-        raise ValueError(f"{path} belongs to another log, model or parameters: choose another folder")
-    return Estimate(**{key: value.item() if value.ndim == 0 else value for key, value in arrays.items()})
+    names, begin = arrays.pop("names").tolist(), arrays.pop("begin")
+    for problem in problems:
+        if names == problem.parameters.names and np.array_equal(begin, problem.windows.begin):
+            values: dict[str, Any] = {key: value.item() if value.ndim == 0 else value for key, value in arrays.items()}
+            return Estimate(**values), problem
+    raise ValueError(f"{path} belongs to another log, model or parameters: choose another folder")

@@ -1,7 +1,7 @@
 """Minimise the squared residuals of all windows over parameters and initial states."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,29 +12,20 @@ _HUBER, _CUT = 3.0, 1e4
 """Residuals count linearly beyond the first multiple of the noise, and are cut at the second."""
 _BAD, _POWER = 1.3, 3
 """A window whose cost exceeds the first multiple of the median counts less, by this power of the ratio."""
-_STEPS, _PARAMETER_STEP = (1e-6, 2e-5, 1e-5), 1e-4
-"""Finite differences of positions, velocities and activations, and of parameters in multiples of the prior."""
-_MEMORIES = (0.015, 0.1, 0.5)
-"""Seconds of memory of the simulations that guess the initial states."""
-_JUMP, _CURVED = 0.003, 0.01
-"""A prediction has jumped in a finite difference if the change by all differences together is not the sum of the single
-changes, up to the first multiple of the noise and the second multiple of the sum of sizes. A few jumps would outweigh
-all smooth changes, make steps much too short, and intervals too narrow."""
+_STEPS, _WIDEST, _SPARE = (1e-5, 5e-4, 5e-5), 0.1, 9
+"""Finite differences of positions, velocities and activations; the largest ones of parameters in multiples of the
+prior; and worlds beyond the fewest that give all derivatives."""
+_MEMORY, _PASSES = 0.1, 10
+"""Seconds of memory of the simulation that guesses the initial states, and how often the windows are joined."""
 _START = (0.1, 1.0, 1.0)
 """Standard deviations of a step of the initial states, which keep unmeasured numbers where they are."""
-_SETTLE = 4
+_SETTLE = 2
 """Steps of the initial states alone, to predict windows with given parameters."""
 _STEADY = 0.03
 """The noise is known if its logarithm changes less."""
-_NEAR, _SLACK = 2.0, 1.01
-"""Steps below the first multiple of a standard deviation are averaged, because contacts make each of them uncertain. A
-step may increase the cost to the second multiple, because contacts change that, too."""
-_SHIFTS = np.array([0.0, -0.3, -0.1, -0.03, 0.03, 0.1, 0.3])
-"""Changes of a delay that are tried, in substeps. At whole substeps, the cost of stiff joints has ridges: the samples
-after a step of the controls, which show the delay best, have other derivatives on the other side."""
-_DRAWS = np.array([0.0] + 5 * [0.1, 0.3, 1.0])
-"""Draws of initial states, in multiples of their posterior's deviation."""
-_DAMPINGS, _STATE_DAMPINGS = (0.0, 0.1, 3.0, 100.0), (0.0, 1.0, 100.0)
+_SLACK = 1.01
+"""A step may increase the cost to this multiple, because contacts change it, too."""
+_DAMPINGS, _STATE_DAMPINGS = (0.0, 0.1, 3.0, 100.0), (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 
 
 @dataclasses.dataclass
@@ -47,12 +38,11 @@ class Estimate:
     """Initial states of the windows, (windows, nq + nv + na)."""
     noise: np.ndarray
     """Standard deviation of each column's noise, (columns,)."""
+    spread: np.ndarray
+    """A root of the parameters' covariance, (parameters, parameters)."""
     move: float = np.inf
-    """The last step's largest change of a parameter in standard deviations, divided by the root of the number of
-    averaged steps; infinite while the noise is not known."""
+    """The last Gauss-Newton step in standard deviations; infinite while the noise is not known."""
     iteration: int = 0
-    averaged: int = 0
-    """Steps whose mean the parameters are."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,8 +76,8 @@ class Linear:
 class LeastSquares:
     """A problem of robust least squares with one initial state per window (multiple shooting).
 
-    The initial states are eliminated from the normal equations window by window, so that a step costs
-    1 + parameters + nx rollouts of the log, and about 20 more for the initial states after each step that is tried.
+    The initial states are eliminated from the normal equations window by window, so that a step costs about
+    10 + parameters + nx rollouts of the log, and 20 more for the initial states after each step that is tried.
 
     Args:
         windows: The windows.
@@ -100,126 +90,129 @@ class LeastSquares:
         self.parameters, model = predictor.parameters, predictor.model
         sizes = (model.nv, model.nv, model.na)
         self.steps, self.ridge = np.repeat(_STEPS, sizes), np.repeat(_START, sizes) ** -2.0
+        self.precision = self.parameters.std**-2.0
         self.seen = ~np.isnan(windows.measured)
         self.seen[..., [quat[-1] for quat in predictor.quats]] = False  # a rotation has three numbers
 
-    def begin(self, x: np.ndarray, noise: np.ndarray) -> Estimate:
+    def begin(self, x: np.ndarray, noise: np.ndarray, spread: np.ndarray | None = None) -> Estimate:
         """Start at parameters, and guess the initial states."""
-        return self._guessed(Estimate(x, np.zeros((0, 0)), noise), [])[0]
+        wide = np.diag(_WIDEST * self.parameters.std) if spread is None else spread
+        return self._joined(Estimate(x, self.predictor.track(self.windows, x, _MEMORY), noise, wide))[0]
 
-    def linearize(self, at: Estimate) -> Linear:
-        """Make the normal equations from finite differences, with one world for each number and window."""
-        p, nx = self.parameters.size, self.predictor.nx
-        eps = np.where(at.x >= self.parameters.high, -_PARAMETER_STEP, _PARAMETER_STEP) * self.parameters.std
-        steps, both = np.concatenate([eps, self.steps]), np.array([[1.0], [-1.0]])
-        moves = np.concatenate([np.zeros((1, p + nx)), np.diag(steps), both * steps])
-        rows = self._rows(at, at.x + moves[:, :p], moves[None, :, p:])
-        parts = [self._equations(part, at, steps) for part in rows]
+    def linearize(self, at: Estimate, *, fixed: bool = False) -> Linear:
+        """Make the normal equations from finite differences, with one world for each number and window.
+
+        With ``fixed``, they are those of the initial states alone.
+        """
+        p = 0 if fixed else len(at.x)
+        spread = np.diag(np.concatenate([np.zeros(p), self.steps]))
+        spread[:p, :p] = at.spread[:p, :p]
+        count = 1 + len(spread) + _SPARE
+        # every world changes all numbers, in orthogonal directions: where a contact begins one substep later, the
+        # prediction jumps, and the derivative by one number alone would be the jump
+        normal = np.random.default_rng(at.iteration).standard_normal((count, count))
+        normal[:, 0] = 1.0
+        moves = np.sqrt(count) * np.linalg.qr(normal)[0][:, 1 : 1 + len(spread)] @ spread.T
+        xs = np.tile(at.x, (1 + count, 1))
+        xs[1:, :p] = np.clip(at.x[:p] + moves[:, :p], self.parameters.low[:p], self.parameters.high[:p])
+        moves[:, :p] = xs[1:, :p] - at.x[:p]
+        changes, units = np.concatenate([np.zeros((1, len(self.steps))), moves[:, p:]]), np.abs(moves).max(axis=0)
+        inverse = np.linalg.pinv(np.column_stack([np.ones(count), moves / units]))[1:] / units[:, None]
+        parts = [self._equations(rows, at, inverse, p) for rows, _ in self._rows(at, xs, changes[None])]
         residuals, *blocks = (np.concatenate(part) for part in zip(*parts, strict=True))
         cost = self._costs(residuals[:, None], np.ones(len(at.noise)))[:, 0]
-        return Linear(residuals, cost, self._weights(cost), *blocks)
-
-    def _weights(self, cost: np.ndarray) -> np.ndarray:
         share = np.maximum(cost, 1e-9) / np.maximum(1, self.seen.sum(axis=(1, 2)))
-        weights: np.ndarray = np.minimum(1.0, _BAD * np.median(share) / share) ** _POWER
-        return weights
+        return Linear(residuals, cost, np.minimum(1.0, _BAD * np.median(share) / share) ** _POWER, *blocks)
 
-    def _equations(self, rows: np.ndarray, at: Estimate, steps: np.ndarray) -> tuple[np.ndarray, ...]:
-        p, count, scale = self.parameters.size, len(rows), np.outer(steps, steps)
-        base = np.clip(rows[:, 0] / at.noise, -_CUT, _CUT)
-        with np.errstate(invalid="ignore"):
-            change, together = np.split((rows[:, 1:] - rows[:, :1]) / at.noise, [len(steps)], axis=1)
-            total, most = change.sum(axis=1), np.maximum(_JUMP, _CURVED * np.abs(change).sum(axis=1))
-            smooth = (np.abs(together[:, 0] - total) < most) & (np.abs(together[:, 1] + total) < most)
-        # a jump, such as a contact one substep later, has no derivative: the sample says nothing in this step
-        jumps = ~smooth[:, None]
-        jacobian, flat = np.where(jumps, 0.0, change).reshape(count, len(steps), -1), base.reshape(count, -1)
+    def _equations(self, rows: np.ndarray, at: Estimate, inverse: np.ndarray, p: int) -> tuple[np.ndarray, ...]:
+        scaled = np.clip(rows / at.noise, -_CUT, _CUT)
+        base, count = scaled[:, 0], len(rows)
+        flat, changes = base.reshape(count, -1), (scaled[:, 1:] - scaled[:, :1]).reshape(count, inverse.shape[1], -1)
+        jacobian = inverse @ changes
         weighted = jacobian * np.minimum(1.0, _HUBER / np.maximum(np.abs(flat), _HUBER))[:, None]
-        square, gradient = weighted @ jacobian.swapaxes(1, 2) / scale, (weighted @ flat[..., None])[..., 0] / steps
+        square, gradient = weighted @ jacobian.swapaxes(1, 2), (weighted @ flat[..., None])[..., 0]
         c = square[:, p:, p:] + np.diag(self.ridge)
         return base, square[:, :p, :p], square[:, :p, p:], c, gradient[:, :p], gradient[:, p:]
 
+    def normal(self, x: np.ndarray, linear: Linear) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Add the prior: the gradient, the information, and a root of the covariance for finite differences."""
+        gradient, information = (part.sum(axis=0) for part in linear.reduced())
+        wide = np.linalg.inv(information + np.diag(self.precision / _WIDEST**2))
+        return gradient + self.precision * x, information + np.diag(self.precision), np.linalg.cholesky(wide)
+
     def iterate(self, at: Estimate) -> Estimate:
-        """Shift the delays, take a damped Gauss-Newton step, and estimate the noise for the next one."""
-        at = self._shifted(at)
+        """Take a damped Gauss-Newton step, and estimate the noise for the next one."""
         linear = self.linearize(at)
         cost, noise = linear.weight @ linear.cost + self.prior(at.x[None])[0], self._noise(at, linear)
-        steady = np.abs(np.log(noise / at.noise)).max() < _STEADY
-        prior, (gradient, information) = self.parameters.std**-2.0, (part.sum(axis=0) for part in linear.reduced())
-        gradient, information = gradient + prior * at.x, information + np.diag(prior)
-        deviation = np.sqrt(np.diag(np.linalg.inv(information)))
-        steps = [self._step(at.x, gradient, information, damping) for damping in _DAMPINGS]
-        near = steady and np.max(np.abs(steps[0]) / deviation) < _NEAR
-        result, move, averaged = at, 0.0, at.averaged + 1 if near else 0
-        for step in steps:
-            x = at.x + step / max(1, averaged)
-            trial, costs = self._guessed(dataclasses.replace(at, x=x), [self._settled(at, linear, x)])
-            if linear.weight @ costs + self.prior(x[None])[0] < _SLACK * cost:
-                result, move = trial, float(np.max(np.abs(step) / deviation)) / max(1, averaged) ** 0.5
+        gradient, information, spread = self.normal(at.x, linear)
+        result, move = at, np.inf
+        for damping in _DAMPINGS:
+            step = self._step(at.x, gradient, information, damping)
+            move = min(move, float(np.sqrt(step @ information @ step)))
+            trial, costs = self._settled(at, linear, at.x + step)
+            if linear.weight @ costs + self.prior(trial.x[None])[0] < _SLACK * cost:
+                result = trial
                 break
-        move, iteration = move if steady else np.inf, at.iteration + 1
-        return dataclasses.replace(result, noise=noise, move=move, iteration=iteration, averaged=averaged)
+        steady = np.abs(np.log(noise / at.noise)).max() < _STEADY
+        return dataclasses.replace(
+            result, noise=noise, spread=spread, move=move if steady else np.inf, iteration=at.iteration + 1
+        )
 
-    def _shifted(self, at: Estimate) -> Estimate:
-        """Move each delay to another side of a ridge if the cost is clearly lower there."""
-        for i in [i for i, c in enumerate(self.parameters.coordinates) if c.kind == "delay"]:
-            xs = np.tile(at.x, (len(_SHIFTS), 1))
-            xs[:, i] += _SHIFTS * self.predictor.model.opt.timestep
-            xs = np.clip(xs, self.parameters.low, self.parameters.high)
-            costs = self.costs(at, xs, np.zeros((1, len(xs), self.predictor.nx)))
-            total = self._weights(costs[:, 0]) @ costs + self.prior(xs)
-            if _SLACK * total.min() < total[0]:
-                at = dataclasses.replace(at, x=xs[total.argmin()], averaged=0)
-        return at
+    def _settled(self, at: Estimate, linear: Linear, x: np.ndarray) -> tuple[Estimate, np.ndarray]:
+        """Move the initial states with the parameters; return the windows' costs, too.
 
-    def _guessed(self, at: Estimate, states: Sequence[np.ndarray]) -> tuple[Estimate, np.ndarray]:
-        """Choose each window's best initial state among the given ones and guesses; return the windows' costs, too."""
-        guesses = np.stack([*states, *self.predictor.track(self.windows, at.x, _MEMORIES)])
-        none, trials = np.zeros((1, 1, self.predictor.nx)), [dataclasses.replace(at, states=s) for s in guesses]
-        costs = np.concatenate([self.costs(trial, at.x[None], none) for trial in trials], axis=1).T
-        best = guesses[costs.argmin(axis=0), np.arange(len(self.windows))]
-        return dataclasses.replace(at, states=best), costs.min(axis=0)
-
-    def _settled(self, at: Estimate, linear: Linear, x: np.ndarray) -> np.ndarray:
-        """Move the initial states with the parameters, each by its own best damping and best draw of its posterior.
-
-        One bad contact must not stop the other windows, and beside a contact only a draw finds the way.
+        Each has its own best damping, because one bad contact must not stop the other windows, or a new guess.
         """
-        gradient = (linear.by_state + np.einsum("wpk,p->wk", linear.b, x - at.x))[..., None]
+        gradient = linear.by_state + np.einsum("wpk,p->wk", linear.b, (x - at.x)[: linear.b.shape[1]])
         diagonal = np.eye(linear.c.shape[1]) * linear.c
-        steps = [-np.linalg.solve(linear.c + mu * diagonal, gradient)[..., 0] for mu in _STATE_DAMPINGS]
-        best = self._best(at, x, np.stack([*steps, np.zeros_like(steps[0])], axis=1))
-        draws = np.random.default_rng(at.iteration).standard_normal((*best.shape, len(_DRAWS))) * _DRAWS
-        spread = np.linalg.cholesky(np.linalg.inv(linear.c)) @ draws
-        changes = self._best(at, x, best[:, None] + spread.swapaxes(1, 2))
-        return self.predictor.moved(at.states, changes)
+        steps = [-np.linalg.solve(linear.c + mu * diagonal, gradient[..., None])[..., 0] for mu in _STATE_DAMPINGS]
+        changes = np.stack([*steps, np.zeros_like(gradient)], axis=1)
+        best = self.costs(at, np.tile(x, (changes.shape[1], 1)), changes).argmin(axis=1)
+        states = self.predictor.moved(at.states, changes[np.arange(len(changes)), best])
+        at = dataclasses.replace(at, x=x, states=states)
+        guess = dataclasses.replace(at, states=self.predictor.track(self.windows, x, _MEMORY))
+        better = (self._judged(guess)[0] < self._judged(at)[0])[:, None]
+        return self._joined(dataclasses.replace(at, states=np.where(better, guess.states, at.states)))
 
-    def _best(self, at: Estimate, x: np.ndarray, changes: np.ndarray) -> np.ndarray:
-        """Choose each window's best change of its initial state among (windows, changes, nx)."""
-        costs = self.costs(at, np.tile(x, (changes.shape[1], 1)), changes)
-        result: np.ndarray = changes[np.arange(len(changes)), costs.argmin(axis=1)]
-        return result
+    def _joined(self, at: Estimate) -> tuple[Estimate, np.ndarray]:
+        """Begin windows where the ones before them end, if this predicts them better; return the windows' costs, too.
+
+        A state that follows from other measurements obeys the contacts, and has little of the sensors' noise.
+        """
+        follows, (costs, ends) = self.windows.follows[:, None], self._judged(at)
+        for _ in range(_PASSES):
+            trial = dataclasses.replace(at, states=np.where(follows, np.roll(ends, 1, axis=0), at.states))
+            trial_costs, trial_ends = self._judged(trial)
+            better = (trial_costs < costs)[:, None]
+            at = dataclasses.replace(at, states=np.where(better, trial.states, at.states))
+            costs, ends = np.minimum(costs, trial_costs), np.where(better, trial_ends, ends)
+        return at, costs
+
+    def _judged(self, at: Estimate) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the costs of the windows, and the states in which they end."""
+        parts = list(self._rows(at, at.x[None], np.zeros((1, 1, self.predictor.nx))))
+        costs = [self._costs(rows, at.noise)[:, 0] for rows, _ in parts]
+        return np.concatenate(costs), np.concatenate([ends for _, ends in parts])
 
     def prediction(self, x: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Compute residuals with given parameters, after an estimate of the initial states alone."""
         at = self.begin(x, noise)
         for _ in range(_SETTLE):
-            at = dataclasses.replace(at, states=self._settled(at, self.linearize(at), x))
-        none = np.zeros((1, 1, self.predictor.nx))
-        rows = np.concatenate([rows[:, 0] for rows in self._rows(at, x[None], none)])
+            at, _ = self._settled(at, self.linearize(at, fixed=True), x)
+        rows = np.concatenate([rows[:, 0] for rows, _ in self._rows(at, x[None], np.zeros((1, 1, self.predictor.nx)))])
         return np.where(self.seen, np.clip(rows / noise, -_CUT, _CUT) * noise, np.nan)
 
     def costs(self, at: Estimate, xs: np.ndarray, changes: np.ndarray) -> np.ndarray:
         """Compute half the robust sum of squares of each window under hypotheses, (windows, hypotheses)."""
-        return np.concatenate([self._costs(rows, at.noise) for rows in self._rows(at, xs, changes)])
+        return np.concatenate([self._costs(rows, at.noise) for rows, _ in self._rows(at, xs, changes)])
 
     def _costs(self, rows: np.ndarray, noise: np.ndarray) -> np.ndarray:
         scaled = np.minimum(np.abs(rows) / noise, _CUT)
         total: np.ndarray = np.where(scaled < _HUBER, 0.5 * scaled**2, _HUBER * (scaled - 0.5 * _HUBER)).sum((2, 3))
         return total
 
-    def _rows(self, at: Estimate, xs: np.ndarray, changes: np.ndarray) -> Any:
-        """Yield the residuals of some windows at a time."""
+    def _rows(self, at: Estimate, xs: np.ndarray, changes: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Yield the residuals and the last states of some windows at a time."""
         group = max(1, WORLDS // len(xs))
         for begin in range(0, len(self.windows), group):
             part = slice(begin, begin + group)
@@ -228,7 +221,7 @@ class LeastSquares:
 
     def prior(self, xs: np.ndarray) -> np.ndarray:
         """Compute minus the logarithm of the prior of hypotheses, (hypotheses,)."""
-        total: np.ndarray = 0.5 * ((xs / self.parameters.std) ** 2).sum(axis=1)
+        total: np.ndarray = 0.5 * (xs**2 @ self.precision)
         return total
 
     def covariance(self, linear: Linear) -> np.ndarray:
@@ -238,7 +231,7 @@ class LeastSquares:
         scatter of the windows then widens the intervals: the changes of the fit without each window (the jackknife).
         """
         gradients, informations = linear.reduced()
-        prior, (count, p) = np.diag(self.parameters.std**-2.0), gradients.shape
+        prior, (count, p) = np.diag(self.precision), gradients.shape
         inverse = np.linalg.inv(informations.sum(axis=0) + prior)
         changes = np.linalg.solve(np.eye(p) - informations @ inverse, gradients[..., None])[..., 0] @ inverse
         variance = (changes**2).sum(axis=0) + np.diag(inverse @ prior @ inverse)
