@@ -37,10 +37,10 @@ _USUAL = {
 }  # fmt: skip
 """Standard deviations of the noise of usual sensors, by kind of measurement."""
 _SHARE_OF_SIGNAL = 0.02
-_CONVERGED = 0.5
-"""A fit ends if a Gauss-Newton step is below this multiple of a standard deviation."""
-_BLOCK, _EVERY = 10, 4
-"""Windows of a block, and which blocks the first iterations use."""
+_LEVELS, _BLOCK, _FEWEST = (16, 4, 1), 10, 20
+"""The first iterations use one of 16 blocks of windows, further ones one of 4, if these are not too few windows."""
+_CONVERGED = (1.0, 0.5)
+"""A level ends if a Gauss-Newton step is below this multiple of a standard deviation; and the last level."""
 _KNOWN = 0.3
 """A parameter is determined if its posterior is narrower than this multiple of its prior."""
 _LARGE = 2.0
@@ -111,32 +111,35 @@ def fit(
     groups, usual = _noise(data, compiled)
     windows, predictor = cut_windows(data, bound, window), Predictor(data, bound, nthread=nthread)
     count = len(windows) - round(held_out * len(windows))
-    problem = LeastSquares(windows.chosen(slice(count)), predictor, groups)
+    blocks = np.arange(count) // _BLOCK
+    problems = [LeastSquares(windows.chosen(np.flatnonzero(blocks % every == 0)), predictor, groups)
+                for every in _LEVELS if every == 1 or (blocks % every == 0).sum() >= _FEWEST]  # fmt: skip
     report = progress or (lambda stage, iteration, cost: None)
     folder = None if out is None else Path(out)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-    some = LeastSquares(problem.windows.chosen(np.arange(count) // _BLOCK % _EVERY == 0), predictor, groups)
-    current = some
     if resume and folder is not None and (folder / "estimate.npz").is_file():
-        at, current = _load(folder / "estimate.npz", [some, problem])
+        at = _load(folder / "estimate.npz", problems)
     else:
         start = np.zeros(bound.size)
         if samples:
             few = np.unique(np.linspace(0, count - 1, 12).astype(int))
-            coarse = LeastSquares(problem.windows.chosen(few), predictor, {})
+            coarse = LeastSquares(windows.chosen(few), predictor, {})
             start = search(coarse, 5.0 * usual, max(8, samples), seed, lambda k, cost: report("search", k, cost))
-        at = some.begin(start, usual)
-    while at.iteration < iterations and (current is some or at.move >= _CONVERGED):
-        at = current.iterate(at)
-        if current is some and at.move < _CONVERGED:
-            current = problem
-            at = dataclasses.replace(problem.begin(at.x, at.noise, at.spread), iteration=at.iteration)
-        if folder is not None:
-            with replaced(folder / "estimate.npz") as path, path.open("wb") as file:
-                np.savez(file, names=bound.names, begin=current.windows.begin, **dataclasses.asdict(at))
-        report("fit", at.iteration, at.move)
-    linear = problem.linearize(at)
+        at = problems[0].begin(start, usual)
+    for problem in problems:
+        linear = None
+        if len(problem.windows) < len(at.states):  # a level that was finished
+            continue
+        if len(problem.windows) > len(at.states):
+            at = problem.begin(at.x, at.noise, at.spread, at.iteration)
+        while at.iteration < iterations and at.move >= _CONVERGED[problem is problems[-1]]:
+            at, linear = problem.iterate(at)
+            if folder is not None:
+                with replaced(folder / "estimate.npz") as path, path.open("wb") as file:
+                    np.savez(file, names=bound.names, begin=problem.windows.begin, **dataclasses.asdict(at))
+            report("fit", at.iteration, at.move)
+    linear = linear or problem.linearize(at)
     held = LeastSquares(windows.chosen(slice(count, None)), predictor, {}) if count < len(windows) else problem
     errors = [held.prediction(x, at.noise) for x in (np.zeros(bound.size), at.x)]
     notes = [*data.notes]
@@ -152,7 +155,7 @@ def fit(
     if folder is not None:
         _write(folder, result, name, bound, covariance, at, seed)
         times = problem.windows.begin[:, None] + compiled.opt.timestep * problem.windows.time
-        write_report(folder, result, name, times, np.where(problem.seen, linear.residuals, np.nan), groups)
+        write_report(folder, result, name, times, problem.residuals(at), groups)
     return result
 
 
@@ -267,13 +270,11 @@ def _write(
         path.write_text(json.dumps(content, indent=1))
 
 
-def _load(path: Path, problems: Sequence[LeastSquares]) -> tuple[Estimate, LeastSquares]:
-    """Read the estimate of an unfinished fit, and find its problem."""
+def _load(path: Path, problems: Sequence[LeastSquares]) -> Estimate:
+    """Read the estimate of an unfinished fit."""
     with np.load(path, allow_pickle=False) as file:
         arrays = dict(file)
     names, begin = arrays.pop("names").tolist(), arrays.pop("begin")
-    for problem in problems:
-        if names == problem.parameters.names and np.array_equal(begin, problem.windows.begin):
-            values: dict[str, Any] = {key: value.item() if value.ndim == 0 else value for key, value in arrays.items()}
-            return Estimate(**values), problem
-    raise ValueError(f"{path} belongs to another log, model or parameters: choose another folder")
+    if names != problems[0].parameters.names or not any(np.array_equal(begin, p.windows.begin) for p in problems):
+        raise ValueError(f"{path} belongs to another log, model or parameters: choose another folder")
+    return Estimate(**{key: value.item() if value.ndim == 0 else value for key, value in arrays.items()})

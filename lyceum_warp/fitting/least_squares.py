@@ -12,15 +12,13 @@ _HUBER, _CUT = 3.0, 1e4
 """Residuals count linearly beyond the first multiple of the noise, and are cut at the second."""
 _BAD, _POWER = 1.3, 3
 """A window whose cost exceeds the first multiple of the median counts less, by this power of the ratio."""
-_STEPS, _WIDEST, _SPARE = (1e-5, 5e-4, 5e-5), 0.1, 9
+_STEPS, _WIDEST, _NARROW, _SPARE = (1e-6, 5e-5, 5e-6), 0.1, 0.1, 9
 """Finite differences of positions, velocities and activations; the largest ones of parameters in multiples of the
-prior; and worlds beyond the fewest that give all derivatives."""
-_MEMORY, _PASSES = 0.1, 10
-"""Seconds of memory of the simulation that guesses the initial states, and how often the windows are joined."""
+prior, and the usual ones in multiples of their uncertainty; and worlds beyond the fewest that give all derivatives."""
+_MEMORY = 0.1
+"""Seconds of memory of the simulation that guesses the initial states."""
 _START = (0.1, 1.0, 1.0)
 """Standard deviations of a step of the initial states, which keep unmeasured numbers where they are."""
-_SETTLE = 2
-"""Steps of the initial states alone, to predict windows with given parameters."""
 _STEADY = 0.03
 """The noise is known if its logarithm changes less."""
 _SLACK = 1.01
@@ -41,7 +39,7 @@ class Estimate:
     spread: np.ndarray
     """A root of the parameters' covariance, (parameters, parameters)."""
     move: float = np.inf
-    """The last Gauss-Newton step in standard deviations; infinite while the noise is not known."""
+    """Root mean square of the last Gauss-Newton step in standard deviations; infinite while the noise is not known."""
     iteration: int = 0
 
 
@@ -49,8 +47,6 @@ class Estimate:
 class Linear:
     """The normal equations of each window, around an estimate."""
 
-    residuals: np.ndarray
-    """In multiples of the noise, (windows, samples, columns)."""
     cost: np.ndarray
     """Costs of the windows, (windows,)."""
     weight: np.ndarray
@@ -90,14 +86,15 @@ class LeastSquares:
         self.parameters, model = predictor.parameters, predictor.model
         sizes = (model.nv, model.nv, model.na)
         self.steps, self.ridge = np.repeat(_STEPS, sizes), np.repeat(_START, sizes) ** -2.0
-        self.precision = self.parameters.std**-2.0
+        self.precision, self.still = self.parameters.std**-2.0, np.zeros((1, 1, predictor.nx))
         self.seen = ~np.isnan(windows.measured)
         self.seen[..., [quat[-1] for quat in predictor.quats]] = False  # a rotation has three numbers
 
-    def begin(self, x: np.ndarray, noise: np.ndarray, spread: np.ndarray | None = None) -> Estimate:
-        """Start at parameters, and guess the initial states."""
+    def begin(self, x: np.ndarray, noise: np.ndarray, spread: np.ndarray | None = None, iteration: int = 0) -> Estimate:
+        """Start at parameters, and estimate the initial states."""
         wide = np.diag(_WIDEST * self.parameters.std) if spread is None else spread
-        return self._joined(Estimate(x, self.predictor.track(self.windows, x, _MEMORY), noise, wide))[0]
+        states = self.predictor.track(self.windows, x, _MEMORY)
+        return self._settled(self._joined(Estimate(x, states, noise, wide, iteration=iteration))[0])[0]
 
     def linearize(self, at: Estimate, *, fixed: bool = False) -> Linear:
         """Make the normal equations from finite differences, with one world for each number and window.
@@ -106,7 +103,7 @@ class LeastSquares:
         """
         p = 0 if fixed else len(at.x)
         spread = np.diag(np.concatenate([np.zeros(p), self.steps]))
-        spread[:p, :p] = at.spread[:p, :p]
+        spread[:p, :p] = _NARROW * at.spread[:p, :p]
         count = 1 + len(spread) + _SPARE
         # every world changes all numbers, in orthogonal directions: where a contact begins one substep later, the
         # prediction jumps, and the derivative by one number alone would be the jump
@@ -119,20 +116,18 @@ class LeastSquares:
         changes, units = np.concatenate([np.zeros((1, len(self.steps))), moves[:, p:]]), np.abs(moves).max(axis=0)
         inverse = np.linalg.pinv(np.column_stack([np.ones(count), moves / units]))[1:] / units[:, None]
         parts = [self._equations(rows, at, inverse, p) for rows, _ in self._rows(at, xs, changes[None])]
-        residuals, *blocks = (np.concatenate(part) for part in zip(*parts, strict=True))
-        cost = self._costs(residuals[:, None], np.ones(len(at.noise)))[:, 0]
+        cost, *blocks = (np.concatenate(part) for part in zip(*parts, strict=True))
         share = np.maximum(cost, 1e-9) / np.maximum(1, self.seen.sum(axis=(1, 2)))
-        return Linear(residuals, cost, np.minimum(1.0, _BAD * np.median(share) / share) ** _POWER, *blocks)
+        return Linear(cost, np.minimum(1.0, _BAD * np.median(share) / share) ** _POWER, *blocks)
 
     def _equations(self, rows: np.ndarray, at: Estimate, inverse: np.ndarray, p: int) -> tuple[np.ndarray, ...]:
         scaled = np.clip(rows / at.noise, -_CUT, _CUT)
-        base, count = scaled[:, 0], len(rows)
-        flat, changes = base.reshape(count, -1), (scaled[:, 1:] - scaled[:, :1]).reshape(count, inverse.shape[1], -1)
-        jacobian = inverse @ changes
+        flat = scaled[:, 0].reshape(len(rows), -1)
+        jacobian = inverse @ (scaled[:, 1:] - scaled[:, :1]).reshape(len(rows), inverse.shape[1], -1)
         weighted = jacobian * np.minimum(1.0, _HUBER / np.maximum(np.abs(flat), _HUBER))[:, None]
         square, gradient = weighted @ jacobian.swapaxes(1, 2), (weighted @ flat[..., None])[..., 0]
         c = square[:, p:, p:] + np.diag(self.ridge)
-        return base, square[:, :p, :p], square[:, :p, p:], c, gradient[:, :p], gradient[:, p:]
+        return self._costs(rows[:, :1], at.noise)[:, 0], square[:, :p, :p], square[:, :p, p:], c, gradient[:, :p], gradient[:, p:]
 
     def normal(self, x: np.ndarray, linear: Linear) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Add the prior: the gradient, the information, and a root of the covariance for finite differences."""
@@ -140,33 +135,35 @@ class LeastSquares:
         wide = np.linalg.inv(information + np.diag(self.precision / _WIDEST**2))
         return gradient + self.precision * x, information + np.diag(self.precision), np.linalg.cholesky(wide)
 
-    def iterate(self, at: Estimate) -> Estimate:
+    def iterate(self, at: Estimate) -> tuple[Estimate, Linear]:
         """Take a damped Gauss-Newton step, and estimate the noise for the next one."""
         linear = self.linearize(at)
-        cost, noise = linear.weight @ linear.cost + self.prior(at.x[None])[0], self._noise(at, linear)
+        cost = linear.weight @ linear.cost + self.prior(at.x[None])[0]
         gradient, information, spread = self.normal(at.x, linear)
-        result, move = at, np.inf
-        for damping in _DAMPINGS:
-            step = self._step(at.x, gradient, information, damping)
-            move = min(move, float(np.sqrt(step @ information @ step)))
-            trial, costs = self._settled(at, linear, at.x + step)
+        steps = [self._step(at.x, gradient, information, damping) for damping in _DAMPINGS]
+        result, move = at, 0.0
+        for step in steps:
+            trial, costs = self._settled(at, linear, step)
             if linear.weight @ costs + self.prior(trial.x[None])[0] < _SLACK * cost:
-                result = trial
+                result, move = trial, float(np.sqrt(steps[0] @ information @ steps[0] / len(at.x)))
                 break
-        steady = np.abs(np.log(noise / at.noise)).max() < _STEADY
-        return dataclasses.replace(
-            result, noise=noise, spread=spread, move=move if steady else np.inf, iteration=at.iteration + 1
-        )
+        noise = self._noise(result)
+        move = move if np.abs(np.log(noise / at.noise)).max() < _STEADY else np.inf
+        return dataclasses.replace(result, noise=noise, spread=spread, move=move, iteration=at.iteration + 1), linear
 
-    def _settled(self, at: Estimate, linear: Linear, x: np.ndarray) -> tuple[Estimate, np.ndarray]:
-        """Move the initial states with the parameters; return the windows' costs, too.
+    def _settled(
+        self, at: Estimate, linear: Linear | None = None, step: np.ndarray | None = None
+    ) -> tuple[Estimate, np.ndarray]:
+        """Move the initial states with a step of the parameters; return the windows' costs, too.
 
         Each has its own best damping, because one bad contact must not stop the other windows, or a new guess.
         """
-        gradient = linear.by_state + np.einsum("wpk,p->wk", linear.b, (x - at.x)[: linear.b.shape[1]])
+        linear, step = linear or self.linearize(at, fixed=True), np.zeros(0) if step is None else step
+        gradient = linear.by_state + np.einsum("wpk,p->wk", linear.b, step)
         diagonal = np.eye(linear.c.shape[1]) * linear.c
         steps = [-np.linalg.solve(linear.c + mu * diagonal, gradient[..., None])[..., 0] for mu in _STATE_DAMPINGS]
         changes = np.stack([*steps, np.zeros_like(gradient)], axis=1)
+        x = at.x + step if len(step) else at.x
         best = self.costs(at, np.tile(x, (changes.shape[1], 1)), changes).argmin(axis=1)
         states = self.predictor.moved(at.states, changes[np.arange(len(changes)), best])
         at = dataclasses.replace(at, x=x, states=states)
@@ -179,28 +176,32 @@ class LeastSquares:
 
         A state that follows from other measurements obeys the contacts, and has little of the sensors' noise.
         """
-        follows, (costs, ends) = self.windows.follows[:, None], self._judged(at)
-        for _ in range(_PASSES):
-            trial = dataclasses.replace(at, states=np.where(follows, np.roll(ends, 1, axis=0), at.states))
-            trial_costs, trial_ends = self._judged(trial)
-            better = (trial_costs < costs)[:, None]
-            at = dataclasses.replace(at, states=np.where(better, trial.states, at.states))
-            costs, ends = np.minimum(costs, trial_costs), np.where(better, trial_ends, ends)
-        return at, costs
+        states, (costs, ends) = at.states.copy(), self._judged(at)
+        which = np.flatnonzero(self.windows.follows)
+        while len(which):
+            trial = dataclasses.replace(at, states=ends[which - 1])
+            trial_costs, trial_ends = self._judged(trial, which)
+            better = trial_costs < costs[which]
+            which, trial_costs, trial_ends = which[better], trial_costs[better], trial_ends[better]
+            states[which], costs[which], ends[which] = trial.states[better], trial_costs, trial_ends
+            which = np.flatnonzero(self.windows.follows & np.isin(np.arange(len(costs)) - 1, which))
+        return dataclasses.replace(at, states=states), costs
 
-    def _judged(self, at: Estimate) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the costs of the windows, and the states in which they end."""
-        parts = list(self._rows(at, at.x[None], np.zeros((1, 1, self.predictor.nx))))
+    def _judged(self, at: Estimate, which: Any = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the costs of windows, and the states in which they end."""
+        parts = list(self._rows(at, at.x[None], self.still, self.windows.chosen(which)))
         costs = [self._costs(rows, at.noise)[:, 0] for rows, _ in parts]
         return np.concatenate(costs), np.concatenate([ends for _, ends in parts])
 
     def prediction(self, x: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Compute residuals with given parameters, after an estimate of the initial states alone."""
-        at = self.begin(x, noise)
-        for _ in range(_SETTLE):
-            at, _ = self._settled(at, self.linearize(at, fixed=True), x)
-        rows = np.concatenate([rows[:, 0] for rows, _ in self._rows(at, x[None], np.zeros((1, 1, self.predictor.nx)))])
-        return np.where(self.seen, np.clip(rows / noise, -_CUT, _CUT) * noise, np.nan)
+        at, _ = self._settled(self.begin(x, noise))
+        return noise * self.residuals(at)
+
+    def residuals(self, at: Estimate) -> np.ndarray:
+        """Compute residuals in multiples of the noise, (windows, samples, columns)."""
+        rows = np.concatenate([rows[:, 0] for rows, _ in self._rows(at, at.x[None], self.still)])
+        return np.where(self.seen, np.clip(rows / at.noise, -_CUT, _CUT), np.nan)
 
     def costs(self, at: Estimate, xs: np.ndarray, changes: np.ndarray) -> np.ndarray:
         """Compute half the robust sum of squares of each window under hypotheses, (windows, hypotheses)."""
@@ -211,13 +212,15 @@ class LeastSquares:
         total: np.ndarray = np.where(scaled < _HUBER, 0.5 * scaled**2, _HUBER * (scaled - 0.5 * _HUBER)).sum((2, 3))
         return total
 
-    def _rows(self, at: Estimate, xs: np.ndarray, changes: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def _rows(
+        self, at: Estimate, xs: np.ndarray, changes: np.ndarray, windows: Windows | None = None
+    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield the residuals and the last states of some windows at a time."""
-        group = max(1, WORLDS // len(xs))
-        for begin in range(0, len(self.windows), group):
+        windows, group = windows or self.windows, max(1, WORLDS // len(xs))
+        for begin in range(0, len(windows), group):
             part = slice(begin, begin + group)
             shift = changes if len(changes) == 1 else changes[part]
-            yield self.predictor.predict(self.windows.chosen(part), at.states[part], xs, shift)
+            yield self.predictor.predict(windows.chosen(part), at.states[part], xs, shift)
 
     def prior(self, xs: np.ndarray) -> np.ndarray:
         """Compute minus the logarithm of the prior of hypotheses, (hypotheses,)."""
@@ -248,13 +251,13 @@ class LeastSquares:
         step: np.ndarray = np.clip(x - np.linalg.solve(whole, free * gradient), low, high) - x
         return step
 
-    def _noise(self, at: Estimate, linear: Linear) -> np.ndarray:
+    def _noise(self, at: Estimate) -> np.ndarray:
         """Estimate the noise of each group of columns from the median of the residuals."""
-        noise, count = at.noise.copy(), len(linear.b) * linear.b.shape[2] + len(at.x)
+        noise, residuals = at.noise.copy(), np.abs(self.residuals(at))
+        count = len(self.windows) * self.predictor.nx + len(at.x)
         free = max(0.1, 1.0 - count / self.seen.sum())  # what parameters and initial states leave of the errors
         for group in self.groups.values():
-            sizes = np.abs(linear.residuals[..., group][self.seen[..., group]])
-            noise[group] *= max(1e-6, float(np.median(sizes)) / 0.6745 / np.sqrt(free))
+            noise[group] *= max(1e-6, float(np.nanmedian(residuals[..., group])) / 0.6745 / np.sqrt(free))
         return noise
 
 
