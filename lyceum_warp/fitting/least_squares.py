@@ -12,9 +12,9 @@ _HUBER, _CUT = 3.0, 1e4
 """Residuals count linearly beyond the first multiple of the noise, and are cut at the second."""
 _BAD, _POWER = 1.3, 3
 """A window whose cost exceeds the first multiple of the median counts less, by this power of the ratio."""
-_STEPS, _WIDEST, _NARROW, _SPARE = (1e-6, 5e-5, 5e-6), 0.1, 0.1, 9
+_STEPS, _WIDEST, _SPARE = (1e-5, 5e-4, 5e-5), 0.1, 3
 """Finite differences of positions, velocities and activations; the largest ones of parameters in multiples of the
-prior, and the usual ones in multiples of their uncertainty; and worlds beyond the fewest that give all derivatives."""
+prior; and worlds beyond the fewest that give all derivatives."""
 _MEMORY = 0.1
 """Seconds of memory of the simulation that guesses the initial states."""
 _START = (0.1, 1.0, 1.0)
@@ -103,7 +103,7 @@ class LeastSquares:
         """
         p = 0 if fixed else len(at.x)
         spread = np.diag(np.concatenate([np.zeros(p), self.steps]))
-        spread[:p, :p] = _NARROW * at.spread[:p, :p]
+        spread[:p, :p] = at.spread[:p, :p]
         count = 1 + len(spread) + _SPARE
         # every world changes all numbers, in orthogonal directions: where a contact begins one substep later, the
         # prediction jumps, and the derivative by one number alone would be the jump
@@ -126,8 +126,8 @@ class LeastSquares:
         jacobian = inverse @ (scaled[:, 1:] - scaled[:, :1]).reshape(len(rows), inverse.shape[1], -1)
         weighted = jacobian * np.minimum(1.0, _HUBER / np.maximum(np.abs(flat), _HUBER))[:, None]
         square, gradient = weighted @ jacobian.swapaxes(1, 2), (weighted @ flat[..., None])[..., 0]
-        c = square[:, p:, p:] + np.diag(self.ridge)
-        return self._costs(rows[:, :1], at.noise)[:, 0], square[:, :p, :p], square[:, :p, p:], c, gradient[:, :p], gradient[:, p:]
+        a, b, c = square[:, :p, :p], square[:, :p, p:], square[:, p:, p:] + np.diag(self.ridge)
+        return self._costs(rows[:, :1], at.noise)[:, 0], a, b, c, gradient[:, :p], gradient[:, p:]
 
     def normal(self, x: np.ndarray, linear: Linear) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Add the prior: the gradient, the information, and a root of the covariance for finite differences."""
@@ -167,9 +167,11 @@ class LeastSquares:
         best = self.costs(at, np.tile(x, (changes.shape[1], 1)), changes).argmin(axis=1)
         states = self.predictor.moved(at.states, changes[np.arange(len(changes)), best])
         at = dataclasses.replace(at, x=x, states=states)
-        guess = dataclasses.replace(at, states=self.predictor.track(self.windows, x, _MEMORY))
-        better = (self._judged(guess)[0] < self._judged(at)[0])[:, None]
-        return self._joined(dataclasses.replace(at, states=np.where(better, guess.states, at.states)))
+        if len(step):
+            guess = dataclasses.replace(at, states=self.predictor.track(self.windows, x, _MEMORY))
+            better = (self._judged(guess)[0] < self._judged(at)[0])[:, None]
+            at = dataclasses.replace(at, states=np.where(better, guess.states, at.states))
+        return self._joined(at)
 
     def _joined(self, at: Estimate) -> tuple[Estimate, np.ndarray]:
         """Begin windows where the ones before them end, if this predicts them better; return the windows' costs, too.
@@ -195,7 +197,7 @@ class LeastSquares:
 
     def prediction(self, x: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Compute residuals with given parameters, after an estimate of the initial states alone."""
-        at, _ = self._settled(self.begin(x, noise))
+        at = self.begin(x, noise)
         return noise * self.residuals(at)
 
     def residuals(self, at: Estimate) -> np.ndarray:

@@ -152,7 +152,9 @@ class Predictor:
                 mujoco.mj_step(model, data)
         return guess
 
-    def predict(self, windows: Windows, states: np.ndarray, xs: np.ndarray, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def predict(
+        self, windows: Windows, states: np.ndarray, xs: np.ndarray, changes: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Compute predictions minus measurements, and the last states.
 
         Args:
@@ -191,9 +193,9 @@ class Predictor:
         for name, (columns, indices) in self.sources.items():
             predicted[..., columns] = records[name][..., indices]
         predicted[batch.warning[:, :, 1].any(axis=1)] = np.inf  # a hypothesis may be absurd
-        predicted = predicted.reshape(len(windows), count, windows.steps, -1)
         ends = np.concatenate([batch.bind(name) for name in state], axis=1)
-        return self._compared(windows, predicted, [signals[i] for i in which]), ends
+        trajectories = predicted.reshape(len(windows), count, windows.steps, -1)
+        return self._compared(windows, trajectories, [signals[i] for i in which]), ends
 
     def moved(self, states: np.ndarray, changes: np.ndarray) -> np.ndarray:
         """Add changes (n, nx) to states (n, nq + nv + na)."""
