@@ -39,7 +39,7 @@ _USUAL = {
 _SHARE_OF_SIGNAL = 0.02
 _LEVELS, _BLOCK, _FEWEST = (16, 4, 1), 10, 20
 """The first iterations use one of 16 blocks of windows, further ones one of 4, if these are not too few windows."""
-_CONVERGED = (1.0, 0.5)
+_CONVERGED = (2.0, 0.5)
 """A level ends if a Gauss-Newton step is below this multiple of a standard deviation; and the last level."""
 _KNOWN = 0.3
 """A parameter is determined if its posterior is narrower than this multiple of its prior."""
@@ -141,7 +141,7 @@ def fit(
             report("fit", at.iteration, at.move)
     linear = linear or problem.linearize(at)
     held = LeastSquares(windows.chosen(slice(count, None)), predictor, {}) if count < len(windows) else problem
-    errors = [held.prediction(x, at.noise) for x in (np.zeros(bound.size), at.x)]
+    errors = [at.noise * held.residuals(held.begin(x, at.noise)) for x in (np.zeros(bound.size), at.x)]
     notes = [*data.notes]
     if held is problem:
         notes.append("no window was held back: errors of prediction are those of the fitted windows")

@@ -12,14 +12,14 @@ _HUBER, _CUT = 3.0, 1e4
 """Residuals count linearly beyond the first multiple of the noise, and are cut at the second."""
 _BAD, _POWER = 1.3, 3
 """A window whose cost exceeds the first multiple of the median counts less, by this power of the ratio."""
-_STEPS, _WIDEST, _SPARE = (1e-5, 5e-4, 5e-5), 0.1, 3
+_STEPS, _WIDEST, _SPARE, _FEWEST = (1e-5, 5e-4, 5e-5), 0.1, 3, 32
 """Finite differences of positions, velocities and activations; the largest ones of parameters in multiples of the
-prior; and worlds beyond the fewest that give all derivatives."""
+prior; worlds beyond the fewest that give all derivatives; and the fewest that average jumps."""
 _MEMORY = 0.1
 """Seconds of memory of the simulation that guesses the initial states."""
 _START = (0.1, 1.0, 1.0)
 """Standard deviations of a step of the initial states, which keep unmeasured numbers where they are."""
-_STEADY = 0.03
+_STEADY = 0.1
 """The noise is known if its logarithm changes less."""
 _SLACK = 1.01
 """A step may increase the cost to this multiple, because contacts change it, too."""
@@ -86,7 +86,7 @@ class LeastSquares:
         self.parameters, model = predictor.parameters, predictor.model
         sizes = (model.nv, model.nv, model.na)
         self.steps, self.ridge = np.repeat(_STEPS, sizes), np.repeat(_START, sizes) ** -2.0
-        self.precision, self.still = self.parameters.std**-2.0, np.zeros((1, 1, predictor.nx))
+        self.precision = self.parameters.std**-2.0
         self.seen = ~np.isnan(windows.measured)
         self.seen[..., [quat[-1] for quat in predictor.quats]] = False  # a rotation has three numbers
 
@@ -94,7 +94,8 @@ class LeastSquares:
         """Start at parameters, and estimate the initial states."""
         wide = np.diag(_WIDEST * self.parameters.std) if spread is None else spread
         states = self.predictor.track(self.windows, x, _MEMORY)
-        return self._settled(self._joined(Estimate(x, states, noise, wide, iteration=iteration))[0])[0]
+        at = self._joined(Estimate(x, states, noise, wide, iteration=iteration))[0]
+        return self._settled(at, self.linearize(at, fixed=True), np.zeros(len(x)))[0]
 
     def linearize(self, at: Estimate, *, fixed: bool = False) -> Linear:
         """Make the normal equations from finite differences, with one world for each number and window.
@@ -104,7 +105,7 @@ class LeastSquares:
         p = 0 if fixed else len(at.x)
         spread = np.diag(np.concatenate([np.zeros(p), self.steps]))
         spread[:p, :p] = at.spread[:p, :p]
-        count = 1 + len(spread) + _SPARE
+        count = max(_FEWEST, 1 + len(spread) + _SPARE)
         # every world changes all numbers, in orthogonal directions: where a contact begins one substep later, the
         # prediction jumps, and the derivative by one number alone would be the jump
         normal = np.random.default_rng(at.iteration).standard_normal((count, count))
@@ -115,7 +116,7 @@ class LeastSquares:
         moves[:, :p] = xs[1:, :p] - at.x[:p]
         changes, units = np.concatenate([np.zeros((1, len(self.steps))), moves[:, p:]]), np.abs(moves).max(axis=0)
         inverse = np.linalg.pinv(np.column_stack([np.ones(count), moves / units]))[1:] / units[:, None]
-        parts = [self._equations(rows, at, inverse, p) for rows, _ in self._rows(at, xs, changes[None])]
+        parts = [self._equations(rows, at, inverse, p) for rows, _ in self._rows(at, xs=xs, changes=changes[None])]
         cost, *blocks = (np.concatenate(part) for part in zip(*parts, strict=True))
         share = np.maximum(cost, 1e-9) / np.maximum(1, self.seen.sum(axis=(1, 2)))
         return Linear(cost, np.minimum(1.0, _BAD * np.median(share) / share) ** _POWER, *blocks)
@@ -138,76 +139,59 @@ class LeastSquares:
     def iterate(self, at: Estimate) -> tuple[Estimate, Linear]:
         """Take a damped Gauss-Newton step, and estimate the noise for the next one."""
         linear = self.linearize(at)
-        cost = linear.weight @ linear.cost + self.prior(at.x[None])[0]
+        cost = linear.weight @ linear.cost + self.prior(at.x)
         gradient, information, spread = self.normal(at.x, linear)
         steps = [self._step(at.x, gradient, information, damping) for damping in _DAMPINGS]
         result, move = at, 0.0
         for step in steps:
             trial, costs = self._settled(at, linear, step)
-            if linear.weight @ costs + self.prior(trial.x[None])[0] < _SLACK * cost:
+            if linear.weight @ costs + self.prior(trial.x) < _SLACK * cost:
                 result, move = trial, float(np.sqrt(steps[0] @ information @ steps[0] / len(at.x)))
                 break
         noise = self._noise(result)
         move = move if np.abs(np.log(noise / at.noise)).max() < _STEADY else np.inf
         return dataclasses.replace(result, noise=noise, spread=spread, move=move, iteration=at.iteration + 1), linear
 
-    def _settled(
-        self, at: Estimate, linear: Linear | None = None, step: np.ndarray | None = None
-    ) -> tuple[Estimate, np.ndarray]:
+    def _settled(self, at: Estimate, linear: Linear, step: np.ndarray) -> tuple[Estimate, np.ndarray]:
         """Move the initial states with a step of the parameters; return the windows' costs, too.
 
-        Each has its own best damping, because one bad contact must not stop the other windows, or a new guess.
+        Each has its own best damping, because one bad contact must not stop the other windows.
         """
-        linear, step = linear or self.linearize(at, fixed=True), np.zeros(0) if step is None else step
-        gradient = linear.by_state + np.einsum("wpk,p->wk", linear.b, step)
+        gradient = linear.by_state + np.einsum("wpk,p->wk", linear.b, step[: linear.b.shape[1]])
         diagonal = np.eye(linear.c.shape[1]) * linear.c
         steps = [-np.linalg.solve(linear.c + mu * diagonal, gradient[..., None])[..., 0] for mu in _STATE_DAMPINGS]
         changes = np.stack([*steps, np.zeros_like(gradient)], axis=1)
-        x = at.x + step if len(step) else at.x
-        best = self.costs(at, np.tile(x, (changes.shape[1], 1)), changes).argmin(axis=1)
+        at = dataclasses.replace(at, x=at.x + step)
+        best = self.judged(at, xs=np.tile(at.x, (changes.shape[1], 1)), changes=changes)[0].argmin(axis=1)
         states = self.predictor.moved(at.states, changes[np.arange(len(changes)), best])
-        at = dataclasses.replace(at, x=x, states=states)
-        if len(step):
-            guess = dataclasses.replace(at, states=self.predictor.track(self.windows, x, _MEMORY))
-            better = (self._judged(guess)[0] < self._judged(at)[0])[:, None]
-            at = dataclasses.replace(at, states=np.where(better, guess.states, at.states))
-        return self._joined(at)
+        return self._joined(dataclasses.replace(at, states=states))
 
     def _joined(self, at: Estimate) -> tuple[Estimate, np.ndarray]:
         """Begin windows where the ones before them end, if this predicts them better; return the windows' costs, too.
 
         A state that follows from other measurements obeys the contacts, and has little of the sensors' noise.
         """
-        states, (costs, ends) = at.states.copy(), self._judged(at)
+        states, (costs, ends) = at.states.copy(), self.judged(at)
         which = np.flatnonzero(self.windows.follows)
         while len(which):
             trial = dataclasses.replace(at, states=ends[which - 1])
-            trial_costs, trial_ends = self._judged(trial, which)
-            better = trial_costs < costs[which]
-            which, trial_costs, trial_ends = which[better], trial_costs[better], trial_ends[better]
-            states[which], costs[which], ends[which] = trial.states[better], trial_costs, trial_ends
+            trial_costs, trial_ends = self.judged(trial, which)
+            better = trial_costs[:, 0] < costs[which, 0]
+            which = which[better]
+            states[which], costs[which], ends[which] = trial.states[better], trial_costs[better], trial_ends[better]
             which = np.flatnonzero(self.windows.follows & np.isin(np.arange(len(costs)) - 1, which))
-        return dataclasses.replace(at, states=states), costs
+        return dataclasses.replace(at, states=states), costs[:, 0]
 
-    def _judged(self, at: Estimate, which: Any = slice(None)) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the costs of windows, and the states in which they end."""
-        parts = list(self._rows(at, at.x[None], self.still, self.windows.chosen(which)))
-        costs = [self._costs(rows, at.noise)[:, 0] for rows, _ in parts]
-        return np.concatenate(costs), np.concatenate([ends for _, ends in parts])
-
-    def prediction(self, x: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Compute residuals with given parameters, after an estimate of the initial states alone."""
-        at = self.begin(x, noise)
-        return noise * self.residuals(at)
+    def judged(self, at: Estimate, which: Any = slice(None), **more: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Compute costs under hypotheses, half the robust sums of squares, (windows, hypotheses), and last states."""
+        parts = [(self._costs(rows, at.noise), ends) for rows, ends in self._rows(at, which, **more)]
+        costs, ends = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return costs, ends
 
     def residuals(self, at: Estimate) -> np.ndarray:
         """Compute residuals in multiples of the noise, (windows, samples, columns)."""
-        rows = np.concatenate([rows[:, 0] for rows, _ in self._rows(at, at.x[None], self.still)])
+        rows = np.concatenate([rows[:, 0] for rows, _ in self._rows(at)])
         return np.where(self.seen, np.clip(rows / at.noise, -_CUT, _CUT), np.nan)
-
-    def costs(self, at: Estimate, xs: np.ndarray, changes: np.ndarray) -> np.ndarray:
-        """Compute half the robust sum of squares of each window under hypotheses, (windows, hypotheses)."""
-        return np.concatenate([self._costs(rows, at.noise) for rows, _ in self._rows(at, xs, changes)])
 
     def _costs(self, rows: np.ndarray, noise: np.ndarray) -> np.ndarray:
         scaled = np.minimum(np.abs(rows) / noise, _CUT)
@@ -215,19 +199,20 @@ class LeastSquares:
         return total
 
     def _rows(
-        self, at: Estimate, xs: np.ndarray, changes: np.ndarray, windows: Windows | None = None
+        self, at: Estimate, which: Any = slice(None), *, xs: np.ndarray | None = None, changes: np.ndarray | None = None
     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield the residuals and the last states of some windows at a time."""
-        windows, group = windows or self.windows, max(1, WORLDS // len(xs))
+        windows, xs = self.windows.chosen(which), at.x[None] if xs is None else xs
+        changes = np.zeros((1, len(xs), self.predictor.nx)) if changes is None else changes
+        group = max(1, WORLDS // len(xs))
         for begin in range(0, len(windows), group):
             part = slice(begin, begin + group)
             shift = changes if len(changes) == 1 else changes[part]
             yield self.predictor.predict(windows.chosen(part), at.states[part], xs, shift)
 
-    def prior(self, xs: np.ndarray) -> np.ndarray:
-        """Compute minus the logarithm of the prior of hypotheses, (hypotheses,)."""
-        total: np.ndarray = 0.5 * (xs**2 @ self.precision)
-        return total
+    def prior(self, x: np.ndarray) -> Any:
+        """Compute minus the logarithm of the prior of hypotheses."""
+        return 0.5 * (x**2 @ self.precision)
 
     def covariance(self, linear: Linear) -> np.ndarray:
         """Compute the covariance of the posterior.
@@ -239,7 +224,7 @@ class LeastSquares:
         prior, (count, p) = np.diag(self.precision), gradients.shape
         inverse = np.linalg.inv(informations.sum(axis=0) + prior)
         changes = np.linalg.solve(np.eye(p) - informations @ inverse, gradients[..., None])[..., 0] @ inverse
-        variance = (changes**2).sum(axis=0) + np.diag(inverse @ prior @ inverse)
+        variance = count * changes.var(axis=0) + np.diag(inverse @ prior @ inverse)
         scale = np.sqrt(np.maximum(1.0, variance / np.diag(inverse)))
         covariance: np.ndarray = scale[:, None] * inverse * scale if count >= 2 * p else inverse
         return covariance
@@ -273,12 +258,11 @@ def search(
     """
     rng, parameters = np.random.default_rng(seed), problem.parameters
     at = problem.begin(np.zeros(parameters.size), noise)
-    mean, std, none = at.x, parameters.std.copy(), np.zeros((1, samples, problem.predictor.nx))
-    best = at.x
+    mean, std, best = at.x, parameters.std.copy(), at.x
     for number in range(5):
         xs = np.clip(mean + std * rng.standard_normal((samples, len(mean))), parameters.low, parameters.high)
         xs[0] = best
-        costs = problem.costs(at, xs, none).sum(axis=0) + problem.prior(xs)
+        costs = problem.judged(at, xs=xs)[0].sum(axis=0) + problem.prior(xs)
         elites = xs[np.argsort(costs)[: max(4, samples // 10)]]
         best, mean, std = elites[0], elites.mean(axis=0), np.maximum(elites.std(axis=0), 0.02 * parameters.std)
         report(number, float(costs.min()))
