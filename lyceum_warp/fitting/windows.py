@@ -167,11 +167,10 @@ class Predictor:
             (windows, hypotheses, samples, columns); missing numbers are 0, and those of diverged worlds are infinite.
             The states after the windows are (windows * hypotheses, nq + nv + na).
         """
-        count, (rows, which) = len(xs), np.unique(xs, axis=0, return_inverse=True)
-        batch = self._batch(len(windows) * count)
-        values = [self.parameters.values(x) for x in rows]
+        values, signals = ([of(x) for x in xs] for of in (self.parameters.values, self.parameters.signals))
+        count, batch = len(xs), self._batch(len(windows) * len(xs))
         for field in self.parameters.touched:
-            batch.expand(field)[...] = np.concatenate([np.stack([v[field] for v in values])[which]] * len(windows))
+            batch.expand(field)[...] = np.concatenate([np.stack([v[field] for v in values])] * len(windows))
         batch.warning[:] = 0
         batch.state[:] = 0.0
         shifts = np.broadcast_to(changes, (len(windows), count, self.nx)).reshape(-1, self.nx)
@@ -180,8 +179,7 @@ class Predictor:
         state = dict(zip(("qpos", "qvel", "act"), parts, strict=True))
         for name, part in state.items():
             batch.bind(name)[...] = part
-        signals = [self.parameters.signals(x) for x in rows]
-        controls = np.stack([self.controls(windows, signal) for signal in signals], axis=1)[:, which]
+        controls = np.stack([self.controls(windows, signal) for signal in signals], axis=1)
         controls = controls.reshape(-1, windows.steps, self.model.nu)
         size = (len(initial), windows.steps)
         records = {name: np.empty((*size, len(getattr(self._data, name)))) for name in self.sources}
@@ -195,7 +193,7 @@ class Predictor:
         predicted[batch.warning[:, :, 1].any(axis=1)] = np.inf  # a hypothesis may be absurd
         ends = np.concatenate([batch.bind(name) for name in state], axis=1)
         trajectories = predicted.reshape(len(windows), count, windows.steps, -1)
-        return self._compared(windows, trajectories, [signals[i] for i in which]), ends
+        return self._compared(windows, trajectories, signals), ends
 
     def moved(self, states: np.ndarray, changes: np.ndarray) -> np.ndarray:
         """Add changes (n, nx) to states (n, nq + nv + na)."""
