@@ -87,7 +87,7 @@ def fit(
         hangs: Whether the robot hung at a fixed base: the free joint is taken away.
         resume: Whether to continue a fit of the same problem in ``out``.
         progress: Called with "search", the round and the least cost, and then with "fit", the iteration and the step's
-            largest change of a parameter in standard deviations.
+            root mean square in standard deviations of the parameters.
         options: Options and parameters of ``lw.make``, such as ``physics`` or ``timestep``.
 
     Raises:
@@ -240,7 +240,7 @@ def _result(
     ends = [np.clip(at.x + sign * 1.96 * deviation, bound.low, bound.high) for sign in (0.0, -1.0, 1.0)]
     value, low, high = (np.array([c.value(x) for c, x in zip(bound.coordinates, end, strict=True)]) for end in ends)
     # in multiples of the priors, a direction of information 1 is known as well from the prior as from the log
-    strength, vectors = np.linalg.eigh(bound.std[:, None] * linear.reduced()[1].sum(axis=0) * bound.std)
+    strength, vectors = np.linalg.eigh(bound.std[:, None] * linear.information.sum(axis=0) * bound.std)
     weak = vectors.T[1.0 / np.sqrt(np.maximum(strength, 0.0) + 1.0) > _KNOWN]
     directions = [{bound.names[i]: float(v[i]) for i in np.argsort(-np.abs(v)) if abs(v[i]) > 0.2} for v in weak]
     rms: dict[str, Any] = {

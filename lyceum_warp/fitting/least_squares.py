@@ -51,22 +51,16 @@ class Linear:
     """Costs of the windows, (windows,)."""
     weight: np.ndarray
     """Weights of the windows, (windows,)."""
-    a: np.ndarray
-    """(windows, parameters, parameters)."""
+    gradient: np.ndarray
+    """Weighted, after elimination of the initial states, (windows, parameters)."""
+    information: np.ndarray
+    """Weighted Fisher information after elimination of the initial states, (windows, parameters, parameters)."""
     b: np.ndarray
     """(windows, parameters, nx)."""
     c: np.ndarray
     """(windows, nx, nx)."""
-    by_x: np.ndarray
-    """Gradients, (windows, parameters)."""
     by_state: np.ndarray
     """Gradients, (windows, nx)."""
-
-    def reduced(self) -> tuple[np.ndarray, np.ndarray]:
-        """Eliminate the initial states: each window's weighted gradient, and its Fisher information."""
-        solved = np.linalg.solve(self.c, np.concatenate([self.b.swapaxes(1, 2), self.by_state[..., None]], axis=2))
-        gradients = self.by_x - np.einsum("wpk,wk->wp", self.b, solved[..., -1])
-        return self.weight[:, None] * gradients, self.weight[:, None, None] * (self.a - self.b @ solved[..., :-1])
 
 
 class LeastSquares:
@@ -117,9 +111,12 @@ class LeastSquares:
         changes, units = np.concatenate([np.zeros((1, len(self.steps))), moves[:, p:]]), np.abs(moves).max(axis=0)
         inverse = np.linalg.pinv(np.column_stack([np.ones(count), moves / units]))[1:] / units[:, None]
         parts = [self._equations(rows, at, inverse, p) for rows, _ in self._rows(at, xs=xs, changes=changes[None])]
-        cost, *blocks = (np.concatenate(part) for part in zip(*parts, strict=True))
+        cost, a, b, c, by_x, by_state = (np.concatenate(part) for part in zip(*parts, strict=True))
         share = np.maximum(cost, 1e-9) / np.maximum(1, self.seen.sum(axis=(1, 2)))
-        return Linear(cost, np.minimum(1.0, _BAD * np.median(share) / share) ** _POWER, *blocks)
+        weight = np.minimum(1.0, _BAD * np.median(share) / share) ** _POWER
+        solved = np.linalg.solve(c, np.concatenate([b.swapaxes(1, 2), by_state[..., None]], axis=2))
+        gradient = weight[:, None] * (by_x - np.einsum("wpk,wk->wp", b, solved[..., -1]))
+        return Linear(cost, weight, gradient, weight[:, None, None] * (a - b @ solved[..., :-1]), b, c, by_state)
 
     def _equations(self, rows: np.ndarray, at: Estimate, inverse: np.ndarray, p: int) -> tuple[np.ndarray, ...]:
         scaled = np.clip(rows / at.noise, -_CUT, _CUT)
@@ -132,7 +129,7 @@ class LeastSquares:
 
     def normal(self, x: np.ndarray, linear: Linear) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Add the prior: the gradient, the information, and a root of the covariance for finite differences."""
-        gradient, information = (part.sum(axis=0) for part in linear.reduced())
+        gradient, information = linear.gradient.sum(axis=0), linear.information.sum(axis=0)
         wide = np.linalg.inv(information + np.diag(self.precision / _WIDEST**2))
         return gradient + self.precision * x, information + np.diag(self.precision), np.linalg.cholesky(wide)
 
@@ -220,10 +217,10 @@ class LeastSquares:
         If the residuals of a window have a common cause, such as wrong contacts, the curvature promises too much. The
         scatter of the windows then widens the intervals: the changes of the fit without each window (the jackknife).
         """
-        gradients, informations = linear.reduced()
-        prior, (count, p) = np.diag(self.precision), gradients.shape
-        inverse = np.linalg.inv(informations.sum(axis=0) + prior)
-        changes = np.linalg.solve(np.eye(p) - informations @ inverse, gradients[..., None])[..., 0] @ inverse
+        prior, (count, p) = np.diag(self.precision), linear.gradient.shape
+        inverse = np.linalg.inv(linear.information.sum(axis=0) + prior)
+        left = np.eye(p) - linear.information @ inverse
+        changes = np.linalg.solve(left, linear.gradient[..., None])[..., 0] @ inverse
         variance = count * changes.var(axis=0) + np.diag(inverse @ prior @ inverse)
         scale = np.sqrt(np.maximum(1.0, variance / np.diag(inverse)))
         covariance: np.ndarray = scale[:, None] * inverse * scale if count >= 2 * p else inverse
