@@ -41,7 +41,7 @@ _LEVELS, _BLOCK, _FEWEST = (16, 4, 1), 10, 20
 """The first iterations use one of 16 blocks of windows, further ones one of 4, if these are not too few windows."""
 _ROUGH, _CONVERGED = 2.0, 0.5
 """A level ends if a Gauss-Newton step is below the first multiple of a standard deviation; and the last level, if the
-step times the ratio of the last two steps of the level before, which is about what is left, is below the second."""
+step times the ratio of the last two steps of the levels before, which is about what is left, is below the second."""
 _KNOWN = 0.3
 """A parameter is determined if its posterior is narrower than this multiple of its prior."""
 _LARGE = 2.0
@@ -128,21 +128,21 @@ def fit(
             coarse = LeastSquares(windows.chosen(few), predictor, {})
             start = search(coarse, 5.0 * usual, max(8, samples), seed, lambda k, cost: report("search", k, cost))
         at = problems[0].begin(start, usual)
-    rate = 1.0
     for problem in problems:
         linear, before = None, np.inf
         if len(problem.windows) < len(at.states):  # a level that was finished
             continue
         if len(problem.windows) > len(at.states):
-            at = problem.begin(at.x, at.noise, at.spread, at.iteration)
-        limit = _CONVERGED / rate if problem is problems[-1] else _ROUGH
+            at = problem.begin(at.x, at.noise, spread=at.spread, rate=at.rate, iteration=at.iteration)
+        limit = _CONVERGED / at.rate if problem is problems[-1] else _ROUGH
         while at.iteration < iterations and at.move >= limit:
             before, (at, linear) = at.move, problem.iterate(at)
             if folder is not None:
                 with replaced(folder / "estimate.npz") as path, path.open("wb") as file:
                     np.savez(file, names=bound.names, begin=problem.windows.begin, **dataclasses.asdict(at))
             report("fit", at.iteration, at.move)
-        rate = rate if np.isinf(before) else float(np.clip(at.move / before, 0.1, 1.0))
+        if at.move and before < np.inf:
+            at.rate = float(np.clip(at.move / before, 0.1, 1.0))
     linear = linear or problem.linearize(at)
     held = LeastSquares(windows.chosen(slice(count, None)), predictor, {}) if count < len(windows) else problem
     errors = [at.noise * held.residuals(held.begin(x, at.noise)) for x in (np.zeros(bound.size), at.x)]

@@ -40,6 +40,8 @@ class Estimate:
     """A root of the parameters' covariance, (parameters, parameters)."""
     move: float = np.inf
     """Root mean square of the last Gauss-Newton step in standard deviations; infinite while the noise is not known."""
+    rate: float = 1.0
+    """About the share of a step that is left after it."""
     iteration: int = 0
 
 
@@ -66,8 +68,8 @@ class Linear:
 class LeastSquares:
     """A problem of robust least squares with one initial state per window (multiple shooting).
 
-    The initial states are eliminated from the normal equations window by window, so that a step costs about
-    10 + parameters + nx rollouts of the log, and 20 more for the initial states after each step that is tried.
+    The initial states are eliminated from the normal equations window by window, so that a step costs
+    5 + parameters + nx rollouts of the log, and about 15 more for the initial states after each step that is tried.
 
     Args:
         windows: The windows.
@@ -84,11 +86,10 @@ class LeastSquares:
         self.seen = ~np.isnan(windows.measured)
         self.seen[..., [quat[-1] for quat in predictor.quats]] = False  # a rotation has three numbers
 
-    def begin(self, x: np.ndarray, noise: np.ndarray, spread: np.ndarray | None = None, iteration: int = 0) -> Estimate:
+    def begin(self, x: np.ndarray, noise: np.ndarray, **more: Any) -> Estimate:
         """Start at parameters, and estimate the initial states."""
-        wide = np.diag(_WIDEST * self.parameters.std) if spread is None else spread
-        states = self.predictor.track(self.windows, x, _MEMORY)
-        at = self._joined(Estimate(x, states, noise, wide, iteration=iteration))[0]
+        more = {"spread": np.diag(_WIDEST * self.parameters.std)} | more
+        at = self._joined(Estimate(x, self.predictor.track(self.windows, x, _MEMORY), noise, **more))[0]
         return self._settled(at, self.linearize(at, fixed=True), np.zeros(len(x)))[0]
 
     def linearize(self, at: Estimate, *, fixed: bool = False) -> Linear:

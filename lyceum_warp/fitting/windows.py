@@ -1,7 +1,6 @@
 """Cut a log into windows, guess their initial states, and predict what each window measured."""
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
@@ -62,7 +61,8 @@ def cut_windows(log: Log, parameters: Parameters, seconds: float) -> Windows:
     """
     model = parameters.nominal
     step, steps = model.opt.timestep, max(2, round(seconds / model.opt.timestep))
-    lead = parameters.longest_delays[model.nu :] / step
+    longest = np.where(np.isfinite(parameters.high), parameters.high, 0.0)
+    lead = parameters.signals(longest)["delay"][model.nu :] / step
     rows: list[tuple[Any, ...]] = []
     for number, take in enumerate(log.takes):
         begin = take.time[0]
@@ -86,7 +86,8 @@ class Predictor:
     """Predicts the measurements of windows under hypotheses, in worlds of the C engine in float64."""
 
     def __init__(self, log: Log, parameters: Parameters, *, nthread: int = 0) -> None:
-        self.log, self.parameters, self.model = log, parameters, parameters.nominal
+        self.log, self.parameters, self.nthread = log, parameters, nthread or cpu_cores()
+        self.model = parameters.nominal
         self.nx = 2 * self.model.nv + self.model.na
         """Numbers by which an initial state may differ from another: positions, velocities and activations."""
         fields, indices = (np.array([getattr(c, name) for c in log.columns]) for name in ("field", "index"))
@@ -100,7 +101,6 @@ class Predictor:
             time = np.concatenate([take.time[:1] - 10.0, take.time, take.time[-1:] + 10.0])
             pieces = np.diff(time)[:, None] * np.concatenate([take.control[:1], take.control])
             self._integrals.append((time, np.pad(np.cumsum(pieces, axis=0), ((1, 0), (0, 0)))))
-        self._batch = functools.lru_cache(4)(lambda worlds: Batch(self.model, worlds, nthread or cpu_cores()))
 
     def track(self, windows: Windows, x: np.ndarray, memory: float) -> np.ndarray:
         """Guess the initial states of windows: simulate each take, and pull the state towards the measurements.
@@ -128,14 +128,11 @@ class Predictor:
             steps = round((windows.begin[members[-1]] - take.time[0]) / step) + 1
             whole = dataclasses.replace(windows.chosen(members[:1]), begin=take.time[:1], steps=steps)
             controls, measured = self.controls(whole, signals)[0], (take.measured - bias) / gain
-            mujoco.mj_resetData(model, data)
-            if model.nkey:
-                data.qpos[:] = model.key_qpos[0]
+            mujoco.mj_resetDataKeyframe(model, data, 0)
             begins = {round((windows.begin[i] - take.time[0]) / step): i for i in members}
             sample, last = 0, -np.inf
             for k in range(steps):
-                now = take.time[0] + k * step
-                while sample < len(take.time) and take.time[sample] < now + 0.5 * step:
+                while sample < len(take.time) and take.time[sample] < take.time[0] + (k + 0.5) * step:
                     pull = 1.0 - np.exp(-(take.time[sample] - last) / memory)
                     position, velocity = data.qpos.copy(), data.qvel.copy()
                     for part, (source, places) in ((position, columns["qpos"]), (velocity, columns["qvel"])):
@@ -168,11 +165,9 @@ class Predictor:
             The states after the windows are (windows * hypotheses, nq + nv + na).
         """
         values, signals = ([of(x) for x in xs] for of in (self.parameters.values, self.parameters.signals))
-        count, batch = len(xs), self._batch(len(windows) * len(xs))
+        count, batch = len(xs), Batch(self.model, len(windows) * len(xs), self.nthread)
         for field in self.parameters.touched:
             batch.expand(field)[...] = np.concatenate([np.stack([v[field] for v in values])] * len(windows))
-        batch.warning[:] = 0
-        batch.state[:] = 0.0
         shifts = np.broadcast_to(changes, (len(windows), count, self.nx)).reshape(-1, self.nx)
         initial = self.moved(np.repeat(states, count, axis=0), shifts)
         parts = np.split(initial, [self.model.nq, self.model.nq + self.model.nv], axis=1)
