@@ -238,8 +238,9 @@ class Plant:
         read = read_log(log, self.bound.nominal)
         bound = Parameters(self.wanted, self.bound.nominal, [column.name for column in read.columns])
         problem = LeastSquares(cut_windows(read, bound, window), Predictor(read, bound), {})
-        information = problem.linearize(problem.begin(self.x, self.noise)).reduced()[1].sum(axis=0)
-        deviation = np.sqrt(np.diag(np.linalg.inv(information + np.diag(self.bound.std**-2.0))))
+        at = problem.begin(self.x, self.noise)
+        at = dataclasses.replace(at, spread=problem.normal(at.x, problem.linearize(at))[2])
+        deviation = np.sqrt(np.diag(np.linalg.inv(problem.normal(at.x, problem.linearize(at))[1])))
         factor = np.array([c.kind == "factor" for c in self.bound.coordinates])
         half: np.ndarray = 1.96 * deviation * np.where(factor, self.values, 1.0) / self.scale
         return half

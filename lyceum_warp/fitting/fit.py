@@ -37,8 +37,11 @@ _USUAL = {
 }  # fmt: skip
 """Standard deviations of the noise of usual sensors, by kind of measurement."""
 _SHARE_OF_SIGNAL = 0.02
-_CONVERGED = 0.3
-"""A fit ends if its last steps leave no parameter uncertain by this multiple of its standard deviation."""
+_LEVELS, _BLOCK, _FEWEST = (16, 4, 1), 10, 20
+"""The first iterations use one of 16 blocks of windows, further ones one of 4, if these are not too few windows."""
+_ROUGH, _CONVERGED = 2.0, 0.5
+"""A level ends if a Gauss-Newton step is below the first multiple of a standard deviation; and the last level, if the
+step times the ratio of the last two steps of the levels before, which is about what is left, is below the second."""
 _KNOWN = 0.3
 """A parameter is determined if its posterior is narrower than this multiple of its prior."""
 _LARGE = 2.0
@@ -84,7 +87,7 @@ def fit(
         hangs: Whether the robot hung at a fixed base: the free joint is taken away.
         resume: Whether to continue a fit of the same problem in ``out``.
         progress: Called with "search", the round and the least cost, and then with "fit", the iteration and the step's
-            largest change of a parameter in standard deviations.
+            root mean square in standard deviations of the parameters.
         options: Options and parameters of ``lw.make``, such as ``physics`` or ``timestep``.
 
     Raises:
@@ -109,29 +112,40 @@ def fit(
     groups, usual = _noise(data, compiled)
     windows, predictor = cut_windows(data, bound, window), Predictor(data, bound, nthread=nthread)
     count = len(windows) - round(held_out * len(windows))
-    problem = LeastSquares(windows.chosen(slice(count)), predictor, groups)
+    blocks = np.arange(count) // _BLOCK
+    problems = [LeastSquares(windows.chosen(np.flatnonzero(blocks % every == 0)), predictor, groups)
+                for every in _LEVELS if every == 1 or (blocks % every == 0).sum() >= _FEWEST]  # fmt: skip
     report = progress or (lambda stage, iteration, cost: None)
     folder = None if out is None else Path(out)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
     if resume and folder is not None and (folder / "estimate.npz").is_file():
-        at = _load(folder / "estimate.npz", problem)
+        at = _load(folder / "estimate.npz", problems)
     else:
         start = np.zeros(bound.size)
         if samples:
-            some = np.unique(np.linspace(0, count - 1, 12).astype(int))
-            coarse = LeastSquares(problem.windows.chosen(some), predictor, {})
+            few = np.unique(np.linspace(0, count - 1, 12).astype(int))
+            coarse = LeastSquares(windows.chosen(few), predictor, {})
             start = search(coarse, 5.0 * usual, max(8, samples), seed, lambda k, cost: report("search", k, cost))
-        at = problem.begin(start, usual)
-    while at.iteration < iterations and at.move >= _CONVERGED:
-        at = problem.iterate(at)
-        if folder is not None:
-            with replaced(folder / "estimate.npz") as path, path.open("wb") as file:
-                np.savez(file, names=bound.names, begin=problem.windows.begin, **dataclasses.asdict(at))
-        report("fit", at.iteration, at.move)
-    linear = problem.linearize(at)
+        at = problems[0].begin(start, usual)
+    for problem in problems:
+        linear, before = None, np.inf
+        if len(problem.windows) < len(at.states):  # a level that was finished
+            continue
+        if len(problem.windows) > len(at.states):
+            at = problem.begin(at.x, at.noise, spread=at.spread, rate=at.rate, iteration=at.iteration)
+        limit = _CONVERGED / at.rate if problem is problems[-1] else _ROUGH
+        while at.iteration < iterations and at.move >= limit:
+            before, (at, linear) = at.move, problem.iterate(at)
+            if folder is not None:
+                with replaced(folder / "estimate.npz") as path, path.open("wb") as file:
+                    np.savez(file, names=bound.names, begin=problem.windows.begin, **dataclasses.asdict(at))
+            report("fit", at.iteration, at.move)
+        if at.move and before < np.inf:
+            at.rate = float(np.clip(at.move / before, 0.1, 1.0))
+    linear = linear or problem.linearize(at)
     held = LeastSquares(windows.chosen(slice(count, None)), predictor, {}) if count < len(windows) else problem
-    errors = [held.prediction(x, at.noise) for x in (np.zeros(bound.size), at.x)]
+    errors = [at.noise * held.residuals(held.begin(x, at.noise)) for x in (np.zeros(bound.size), at.x)]
     notes = [*data.notes]
     if held is problem:
         notes.append("no window was held back: errors of prediction are those of the fitted windows")
@@ -145,7 +159,7 @@ def fit(
     if folder is not None:
         _write(folder, result, name, bound, covariance, at, seed)
         times = problem.windows.begin[:, None] + compiled.opt.timestep * problem.windows.time
-        write_report(folder, result, name, times, np.where(problem.seen, linear.residuals, np.nan), groups)
+        write_report(folder, result, name, times, problem.residuals(at), groups)
     return result
 
 
@@ -226,7 +240,7 @@ def _result(
     ends = [np.clip(at.x + sign * 1.96 * deviation, bound.low, bound.high) for sign in (0.0, -1.0, 1.0)]
     value, low, high = (np.array([c.value(x) for c, x in zip(bound.coordinates, end, strict=True)]) for end in ends)
     # in multiples of the priors, a direction of information 1 is known as well from the prior as from the log
-    strength, vectors = np.linalg.eigh(bound.std[:, None] * linear.reduced()[1].sum(axis=0) * bound.std)
+    strength, vectors = np.linalg.eigh(bound.std[:, None] * linear.information.sum(axis=0) * bound.std)
     weak = vectors.T[1.0 / np.sqrt(np.maximum(strength, 0.0) + 1.0) > _KNOWN]
     directions = [{bound.names[i]: float(v[i]) for i in np.argsort(-np.abs(v)) if abs(v[i]) > 0.2} for v in weak]
     rms: dict[str, Any] = {
@@ -260,12 +274,11 @@ def _write(
         path.write_text(json.dumps(content, indent=1))
 
 
-def _load(path: Path, problem: LeastSquares) -> Estimate:
+def _load(path: Path, problems: Sequence[LeastSquares]) -> Estimate:
     """Read the estimate of an unfinished fit."""
     with np.load(path, allow_pickle=False) as file:
         arrays = dict(file)
-    if arrays.pop("names").tolist() != problem.parameters.names or not np.array_equal(
-        arrays.pop("begin"), problem.windows.begin
-    ):
+    names, begin = arrays.pop("names").tolist(), arrays.pop("begin")
+    if names != problems[0].parameters.names or not any(np.array_equal(begin, p.windows.begin) for p in problems):
         raise ValueError(f"{path} belongs to another log, model or parameters: choose another folder")
     return Estimate(**{key: value.item() if value.ndim == 0 else value for key, value in arrays.items()})

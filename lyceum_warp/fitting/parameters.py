@@ -224,11 +224,6 @@ class Parameters:
                 values[coordinate.kind][coordinate.signals] += value
         return values | {"gain": np.exp(values["gain"])}
 
-    @property
-    def longest_delays(self) -> np.ndarray:
-        """The greatest delay of each control and column that the bounds allow."""
-        return self.signals(np.where(np.isfinite(self.high), self.high, 0.0))["delay"]
-
     def fields(self, x: np.ndarray) -> dict[str, dict[str, list[Any]]]:
         """Get the rows that the fit changes, by field and element."""
         values = self.values(x)

@@ -1,8 +1,6 @@
 """Cut a log into windows, guess their initial states, and predict what each window measured."""
 
 import dataclasses
-import functools
-import itertools
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
@@ -33,6 +31,8 @@ class Windows:
     """Time at which each window begins, (windows,)."""
     steps: int
     """Substeps of a window."""
+    seconds: float
+    """Their duration."""
     time: np.ndarray
     """Times of the samples since the window's beginning in substeps, (windows, samples)."""
     measured: np.ndarray
@@ -40,6 +40,12 @@ class Windows:
 
     def __len__(self) -> int:
         return len(self.take)
+
+    @property
+    def follows(self) -> np.ndarray:
+        """Whether each window begins where the one before it ends, (windows,)."""
+        late = self.begin - np.roll(self.begin, 1) - self.seconds
+        return (self.take == np.roll(self.take, 1)) & (np.abs(late) < 1e-6)
 
     def chosen(self, which: Any) -> "Windows":
         """Select windows."""
@@ -55,7 +61,8 @@ def cut_windows(log: Log, parameters: Parameters, seconds: float) -> Windows:
     """
     model = parameters.nominal
     step, steps = model.opt.timestep, max(2, round(seconds / model.opt.timestep))
-    lead = parameters.longest_delays[model.nu :] / step
+    longest = np.where(np.isfinite(parameters.high), parameters.high, 0.0)
+    lead = parameters.signals(longest)["delay"][model.nu :] / step
     rows: list[tuple[Any, ...]] = []
     for number, take in enumerate(log.takes):
         begin = take.time[0]
@@ -71,14 +78,16 @@ def cut_windows(log: Log, parameters: Parameters, seconds: float) -> Windows:
     time, measured = np.zeros((len(rows), most)), np.full((len(rows), most, len(log.columns)), np.nan)
     for i, row in enumerate(rows):
         time[i, : len(row[2])], measured[i, : len(row[2])] = row[2:]
-    return Windows(np.array([row[0] for row in rows]), np.array([row[1] for row in rows]), steps, time, measured)
+    takes, begins = (np.array([row[k] for row in rows]) for k in (0, 1))
+    return Windows(takes, begins, steps, steps * step, time, measured)
 
 
 class Predictor:
     """Predicts the measurements of windows under hypotheses, in worlds of the C engine in float64."""
 
     def __init__(self, log: Log, parameters: Parameters, *, nthread: int = 0) -> None:
-        self.log, self.parameters, self.model = log, parameters, parameters.nominal
+        self.log, self.parameters, self.nthread = log, parameters, nthread or cpu_cores()
+        self.model = parameters.nominal
         self.nx = 2 * self.model.nv + self.model.na
         """Numbers by which an initial state may differ from another: positions, velocities and activations."""
         fields, indices = (np.array([getattr(c, name) for c in log.columns]) for name in ("field", "index"))
@@ -86,9 +95,14 @@ class Predictor:
         """Places of each field's columns in the log, and their indices in the field."""
         self.quats = _quaternions(log.columns, self.model)
         self._data = mujoco.MjData(self.model)
-        self._batch = functools.lru_cache(4)(lambda worlds: Batch(self.model, worlds, nthread or cpu_cores()))
+        self._integrals = []
+        for take in log.takes:
+            # the first and the last control hold before and after the take
+            time = np.concatenate([take.time[:1] - 10.0, take.time, take.time[-1:] + 10.0])
+            pieces = np.diff(time)[:, None] * np.concatenate([take.control[:1], take.control])
+            self._integrals.append((time, np.pad(np.cumsum(pieces, axis=0), ((1, 0), (0, 0)))))
 
-    def track(self, windows: Windows, x: np.ndarray, memories: Sequence[float]) -> list[np.ndarray]:
+    def track(self, windows: Windows, x: np.ndarray, memory: float) -> np.ndarray:
         """Guess the initial states of windows: simulate each take, and pull the state towards the measurements.
 
         The result has less noise than the measurements, obeys the contacts, and fills what was not measured.
@@ -96,32 +110,29 @@ class Predictor:
         Args:
             windows: The windows.
             x: Coordinates of the parameters.
-            memories: Seconds in which a simulation forgets its own state. A long memory suits a good model.
+            memory: Seconds in which the simulation forgets its own state.
 
         Returns:
-            qpos, qvel and act for each memory, (windows, nq + nv + na).
+            qpos, qvel and act, (windows, nq + nv + na).
         """
         model, signals = self.parameters.model(x), self.parameters.signals(x)
         data, step = self._data, model.opt.timestep
-        states = [np.empty((len(windows), model.nq + model.nv + model.na)) for _ in memories]
+        guess = np.empty((len(windows), model.nq + model.nv + model.na))
         gain, bias = (signals[name][model.nu :] for name in ("gain", "bias"))
         none = np.zeros((2, 0), int)
         columns = {name: self.sources.get(name, none) for name in ("qpos", "qvel")}
         # velocities that are not measured follow from positions
         change, derived = np.zeros(model.nv), ~np.isin(np.arange(model.nv), columns["qvel"][1])
-        for (guess, memory), number in itertools.product(zip(states, memories, strict=True), np.unique(windows.take)):
+        for number in np.unique(windows.take):
             take, members = self.log.takes[number], np.flatnonzero(windows.take == number)
             steps = round((windows.begin[members[-1]] - take.time[0]) / step) + 1
             whole = dataclasses.replace(windows.chosen(members[:1]), begin=take.time[:1], steps=steps)
             controls, measured = self.controls(whole, signals)[0], (take.measured - bias) / gain
-            mujoco.mj_resetData(model, data)
-            if model.nkey:
-                data.qpos[:] = model.key_qpos[0]
+            mujoco.mj_resetDataKeyframe(model, data, 0)
             begins = {round((windows.begin[i] - take.time[0]) / step): i for i in members}
             sample, last = 0, -np.inf
             for k in range(steps):
-                now = take.time[0] + k * step
-                while sample < len(take.time) and take.time[sample] < now + 0.5 * step:
+                while sample < len(take.time) and take.time[sample] < take.time[0] + (k + 0.5) * step:
                     pull = 1.0 - np.exp(-(take.time[sample] - last) / memory)
                     position, velocity = data.qpos.copy(), data.qvel.copy()
                     for part, (source, places) in ((position, columns["qpos"]), (velocity, columns["qvel"])):
@@ -136,10 +147,12 @@ class Predictor:
                     guess[begins[k]] = np.concatenate([data.qpos, data.qvel, data.act])
                 data.ctrl[:] = controls[k]
                 mujoco.mj_step(model, data)
-        return states
+        return guess
 
-    def predict(self, windows: Windows, states: np.ndarray, xs: np.ndarray, changes: np.ndarray) -> np.ndarray:
-        """Compute predictions minus measurements.
+    def predict(
+        self, windows: Windows, states: np.ndarray, xs: np.ndarray, changes: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Compute predictions minus measurements, and the last states.
 
         Args:
             windows: The windows.
@@ -148,23 +161,20 @@ class Predictor:
             changes: Changes of the initial states, (1 or windows, hypotheses, nx).
 
         Returns:
-            (windows, hypotheses, samples, columns). Missing numbers are 0, and those of diverged worlds are infinite.
+            (windows, hypotheses, samples, columns); missing numbers are 0, and those of diverged worlds are infinite.
+            The states after the windows are (windows * hypotheses, nq + nv + na).
         """
-        count, (rows, which) = len(xs), np.unique(xs, axis=0, return_inverse=True)
-        batch = self._batch(len(windows) * count)
-        values = [self.parameters.values(x) for x in rows]
+        values, signals = ([of(x) for x in xs] for of in (self.parameters.values, self.parameters.signals))
+        count, batch = len(xs), Batch(self.model, len(windows) * len(xs), self.nthread)
         for field in self.parameters.touched:
-            batch.expand(field)[...] = np.concatenate([np.stack([v[field] for v in values])[which]] * len(windows))
-        batch.warning[:] = 0
-        batch.state[:] = 0.0
+            batch.expand(field)[...] = np.concatenate([np.stack([v[field] for v in values])] * len(windows))
         shifts = np.broadcast_to(changes, (len(windows), count, self.nx)).reshape(-1, self.nx)
         initial = self.moved(np.repeat(states, count, axis=0), shifts)
         parts = np.split(initial, [self.model.nq, self.model.nq + self.model.nv], axis=1)
         state = dict(zip(("qpos", "qvel", "act"), parts, strict=True))
         for name, part in state.items():
             batch.bind(name)[...] = part
-        signals = [self.parameters.signals(x) for x in rows]
-        controls = np.stack([self.controls(windows, signal) for signal in signals], axis=1)[:, which]
+        controls = np.stack([self.controls(windows, signal) for signal in signals], axis=1)
         controls = controls.reshape(-1, windows.steps, self.model.nu)
         size = (len(initial), windows.steps)
         records = {name: np.empty((*size, len(getattr(self._data, name)))) for name in self.sources}
@@ -176,9 +186,9 @@ class Predictor:
         for name, (columns, indices) in self.sources.items():
             predicted[..., columns] = records[name][..., indices]
         predicted[batch.warning[:, :, 1].any(axis=1)] = np.inf  # a hypothesis may be absurd
-        return self._compared(
-            windows, predicted.reshape(len(windows), count, windows.steps, -1), [signals[i] for i in which]
-        )
+        ends = np.concatenate([batch.bind(name) for name in state], axis=1)
+        trajectories = predicted.reshape(len(windows), count, windows.steps, -1)
+        return self._compared(windows, trajectories, signals), ends
 
     def moved(self, states: np.ndarray, changes: np.ndarray) -> np.ndarray:
         """Add changes (n, nx) to states (n, nq + nv + na)."""
@@ -196,11 +206,7 @@ class Predictor:
         delay, gain, bias = (signals[name][:nu] for name in ("delay", "gain", "bias"))
         means = np.empty((len(windows), windows.steps, nu))
         for number in np.unique(windows.take):
-            take, members = self.log.takes[number], windows.take == number
-            # the first and the last control hold before and after the take
-            time = np.concatenate([take.time[:1] - 10.0, take.time, take.time[-1:] + 10.0])
-            pieces = np.diff(time)[:, None] * np.concatenate([take.control[:1], take.control])
-            integral = np.concatenate([np.zeros((1, nu)), np.cumsum(pieces, axis=0)])
+            (time, integral), members = self._integrals[number], windows.take == number
             edges = windows.begin[members, None] + step * np.arange(windows.steps + 1)
             for i in range(nu):
                 means[members, :, i] = np.diff(np.interp(edges - delay[i], time, integral[:, i]), axis=1) / step

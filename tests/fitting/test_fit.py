@@ -79,6 +79,17 @@ def test_finished_fit_resumes_without_further_steps(arm: tuple[Fit, dict[str, An
         lw.fit(mujoco.MjSpec.from_string(ARM), log, PARAMETERS[1:], out=folder, resume=True, samples=0, nthread=1)
 
 
+def test_stopped_fit_resumes_on_its_part_of_the_log(tmp_path: Path) -> None:
+    log = log_of(ARM, ["kp.*"], {"kp.*": 0.2}, controls(10.0))
+    settings: dict[str, Any] = {"samples": 0, "window": 0.1, "nthread": 1}
+    whole = lw.fit(mujoco.MjSpec.from_string(ARM), log, ["kp.*"], **settings)
+    lw.fit(mujoco.MjSpec.from_string(ARM), log, ["kp.*"], out=tmp_path, iterations=1, **settings)
+    with np.load(tmp_path / "estimate.npz") as file:
+        assert len(file["states"]) == 20  # two blocks of ten windows
+    again = lw.fit(mujoco.MjSpec.from_string(ARM), log, ["kp.*"], out=tmp_path, resume=True, **settings)
+    assert np.array_equal(again.value, whole.value) and np.array_equal(again.low, whole.low)
+
+
 def test_parameters_that_a_log_cannot_tell_apart_are_named() -> None:
     # below the servo's limit, its kd and the joint's damping both multiply the velocity
     log = log_of(ARM, ["kd.shoulder"], {}, lw.excitation([-0.2] * 2, [0.2] * 2, seconds=4.0, rate=100))
@@ -131,12 +142,13 @@ def test_small_jumps_of_predictions_neither_stop_a_fit_nor_narrow_its_intervals(
 ) -> None:
     smooth = Predictor.predict
 
-    def jumping(self: Predictor, windows: Windows, states: np.ndarray, xs: np.ndarray, *more: Any) -> np.ndarray:
+    def jumping(self: Predictor, windows: Windows, states: np.ndarray, xs: np.ndarray, *more: Any) -> Any:
         # a number that grows with the parameters and falls by 0.2 times the noise, as the time from a foot's contact
         # to the end of its substep: few of the finite differences meet a fall
         phase = 20.0 * xs.sum(axis=1)[:, None, None] + 1e4 * windows.measured[:, None]
         late = 0.2 * np.repeat([NOISE["qpos"], NOISE["qvel"]], 2) * (phase % 1.0 - 0.5)
-        return smooth(self, windows, states, xs, *more) + late
+        rows, ends = smooth(self, windows, states, xs, *more)
+        return rows + late, ends
 
     truth = {"kp.*": 0.2, "dof_damping.*": -0.2, "body_mass.lower": 0.2}
     log = log_of(ARM, list(truth), truth, controls(4.0))
