@@ -70,8 +70,8 @@ STRONG_TRACKING_GAIT = (
     "--param", "track_linear_velocity=10", "--param", "track_angular_velocity=5", "--param", "gait_clock=8",
     "--param", "roll_pitch_rate_l2=-0.4", "--param", "growth_steps=50000",
     "--param", "growing_joint_velocity_l2=-0.03", "--param", "growing_action_rate_l2=-4",
-    "--gamma", "0.97", "--desired-kl", "0.04", "--log-std", "0", "--entropy-coef", "0.005", "--epochs", "3",
-    "--gate-every", "48", "--exact-from", "1000000",
+    "--gamma", "0.97", "--desired-kl", "0.04", "--log-std", "0", "--entropy-coef", "0.005",
+    "--gate-every", "48", "--exact-from", "1000000", "--epochs", "3",
 )  # fmt: skip
 """Reward weights and exploration for few samples, for robots with a gait clock. The costs of fast motion grow until the
 policy passes. Each of few worlds makes many steps, so the growth takes more steps of a world. Exact physics, which the
