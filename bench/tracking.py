@@ -188,15 +188,17 @@ def tables(rows: Sequence[Row]) -> list[Table]:
             *_, last = policies.values()
             lines.append([
                 sampling, str(seed), *(str(policies[mark]["failures"]) if mark in policies else "" for mark in marks),
-                f"{last['samples'] / 1e6:.3g}", f"{last['score']:.3f}",
+                f"{last['samples'] / 1e6:.3g}", f"{last['score']:.3f}", f"{last['return']:.1f}",
                 *(f"{1000 * sum(last[name]) / len(last[name]):.0f}" for name in ("mpkpe", "r_mpkpe")),
             ])  # fmt: skip
         title = (
             f"{task} on {device}, clips {clips}{f', `{flags}`' if flags else ''}: how many of {same[0].result['clips']}"
-            " clips fail on the C engine by minutes from process start; samples, score and errors of the last policy."
+            " clips fail on the C engine by minutes from process start; samples, score, return and errors of the last "
+            "policy."
         )
         header = [
-            "starts", "seed", *(f"{mark:g}" for mark in marks), "million samples", "score", "MPKPE, mm", "R-MPKPE, mm",
+            "starts", "seed", *(f"{mark:g}" for mark in marks), "million samples", "score", "return", "MPKPE, mm",
+            "R-MPKPE, mm",
         ]  # fmt: skip
         tables.append(Table(title, header, lines))
     return tables

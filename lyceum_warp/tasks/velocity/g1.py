@@ -28,6 +28,8 @@ class Params(walking.BipedParams):
     action_scale: wp.array[float] = 12 * [0.5]
     swing_target: float = 0.12  # the sites are 0.04 m above the soles
     least_height: float = 0.35
+    stages: wp.array2d[float] = [[0.0, -0.6, 1.0, 1.0]]
+    lateral_velocity: float = 0.5
 
 
 @wp.struct

@@ -16,8 +16,6 @@ class Params(walking.BipedParams):
     walking_pose_std: wp.array[float] = 2 * [0.15, 0.15, 0.3, 0.35, 0.25]
     action_scale: wp.array[float] = 10 * [0.5]
     least_height: float = 0.5
-    stages: wp.array2d[float] = [[0.0, -1.0, 1.0, 1.0]]  # as far as the gate asks
-    lateral_velocity: float = 0.6
 
 
 @lw.register

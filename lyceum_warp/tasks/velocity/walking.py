@@ -428,8 +428,8 @@ class Velocity(lw.Task):
 
 @wp.struct
 class BipedParams(Params):
-    stages: wp.array2d[float] = [[0.0, -0.6, 1.0, 1.0]]
-    lateral_velocity: float = 0.5
+    stages: wp.array2d[float] = [[0.0, -1.0, 1.0, 1.0]]  # gates.Walks asks for up to 1 m/s backwards
+    lateral_velocity: float = 0.6
     push_seconds: wp.vec2 = wp.vec2(5.0, 10.0)
     fall_angle: float = math.acos(0.6)
 
