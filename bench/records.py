@@ -66,6 +66,9 @@ FEW_EPOCHS = (
     "--gamma", "0.97", "--desired-kl", "0.04", "--epochs", "3", "--entropy-coef", "0.006", "--gate-every", "36",
 )  # fmt: skip
 """Updates that take less time than the samples: with five epochs, they take more on two cores."""
+TURNING = (
+    "--param", "track_angular_velocity=4", "--desired-kl", "0.04", "--log-std", "0", "--gate-every", "48",
+)  # fmt: skip
 STRONG_TRACKING_GAIT = (
     "--param", "track_linear_velocity=10", "--param", "track_angular_velocity=5", "--param", "gait_clock=8",
     "--param", "roll_pitch_rate_l2=-0.4", "--param", "growth_steps=50000",
@@ -116,7 +119,7 @@ RECORDS: dict[str, dict[str, tuple[float | None, tuple[str, ...]]]] = {
         "cuda": (None, (*WALKING, *GROWING)),
     },
     "t1_velocity": {
-        "cpu": (None, (*WALKING, *FEW_WORLDS, *STRONG_TRACKING, "--log-std", "0")),
+        "cpu": (None, (*WALKING, *FEW_WORLDS, *STRONG_TRACKING, *TURNING)),
         "cuda": (None, WALKING),
     },
     "inverted_pendulum": {"cpu": (950.0, NPG), "cuda": (950.0, LARGE)},
