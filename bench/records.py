@@ -66,9 +66,11 @@ FEW_EPOCHS = (
     "--gamma", "0.97", "--desired-kl", "0.04", "--epochs", "3", "--entropy-coef", "0.006", "--gate-every", "36",
 )  # fmt: skip
 """Updates that take less time than the samples: with five epochs, they take more on two cores."""
-TURNING = (
+WIDE_EXPLORATION = (
     "--param", "track_angular_velocity=4", "--desired-kl", "0.04", "--log-std", "0", "--gate-every", "48",
+    "--final-entropy-coef", "0.001", "--entropy-decay", "200", "400",
 )  # fmt: skip
+"""Exploration that ends the time in which a T1 only stands, and then decreases, so that the robot walks precisely."""
 STRONG_TRACKING_GAIT = (
     "--param", "track_linear_velocity=10", "--param", "track_angular_velocity=5", "--param", "gait_clock=8",
     "--param", "roll_pitch_rate_l2=-0.4", "--param", "growth_steps=50000",
@@ -119,7 +121,7 @@ RECORDS: dict[str, dict[str, tuple[float | None, tuple[str, ...]]]] = {
         "cuda": (None, (*WALKING, *GROWING)),
     },
     "t1_velocity": {
-        "cpu": (None, (*WALKING, *FEW_WORLDS, *STRONG_TRACKING, *TURNING)),
+        "cpu": (None, (*WALKING, *FEW_WORLDS, *STRONG_TRACKING, *WIDE_EXPLORATION)),
         "cuda": (None, WALKING),
     },
     "inverted_pendulum": {"cpu": (950.0, NPG), "cuda": (950.0, LARGE)},
