@@ -22,7 +22,7 @@ ParamWords = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
     tyro.conf.arg(
         metavar="NAME=VALUE",
-        help="A parameter of the task. Write a vector as NAME=0.7,inf and a table as NAME=file.npy. The flag "
+        help="A parameter of the task. Write a vector as NAME=0.7,inf and a table as NAME=[[1,2],[3,4]] or NAME=file.npy. The flag "
         "may be repeated.",
     ),
 ]
@@ -164,6 +164,8 @@ def parameter(text: str) -> tuple[str, Any]:
         raise ValueError(f"{text!r} must be written as NAME=VALUE")
     if value.endswith(".npy"):
         return name, str(Path(os.path.expanduser(value)).resolve())
+    if value.startswith("[["):
+        return name, [[_value(part, text) for part in row.split(",")] for row in re.split(r"\]\s*,\s*\[", value[2:-2])]
     values = [_value(part, text) for part in parts]
     return name, values[0] if len(values) == 1 else values
 
