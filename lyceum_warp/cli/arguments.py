@@ -22,8 +22,8 @@ ParamWords = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
     tyro.conf.arg(
         metavar="NAME=VALUE",
-        help="A parameter of the task. Write a vector as NAME=0.7,inf and a table as NAME=[[1,2],[3,4]] or NAME=file.npy. The flag "
-        "may be repeated.",
+        help="A parameter of the task. Write a vector as NAME=0.7,inf and a table as NAME=[[1,2],[3,4]] or "
+        "NAME=file.npy. The flag may be repeated.",
     ),
 ]
 
@@ -157,15 +157,15 @@ def parameters(texts: Iterable[str]) -> dict[str, Any]:
 
 
 def parameter(text: str) -> tuple[str, Any]:
-    """Parse a task parameter or a solver limit, such as NAME=VALUE or NAME=0.7,inf."""
+    """Parse a task parameter or a solver limit, such as NAME=VALUE, NAME=0.7,inf or NAME=[[1,2],[3,4]]."""
     name, _, value = map(str.strip, text.partition("="))
     parts = [part for part in value.strip("[]()").split(",") if part.strip()]
     if not name or not parts:
         raise ValueError(f"{text!r} must be written as NAME=VALUE")
     if value.endswith(".npy"):
         return name, str(Path(os.path.expanduser(value)).resolve())
-    if value.startswith("[["):
-        return name, [[_value(part, text) for part in row.split(",")] for row in re.split(r"\]\s*,\s*\[", value[2:-2])]
+    if table := re.fullmatch(r"\[\[(.+)\]\]", value):
+        return name, [[_value(part, text) for part in row.split(",")] for row in re.split(r"\]\s*,\s*\[", table[1])]
     values = [_value(part, text) for part in parts]
     return name, values[0] if len(values) == 1 else values
 
