@@ -156,8 +156,8 @@ def test_bench_refuses_unknown_programs_and_needs_a_checkout(
 
 @pytest.mark.parametrize("text, value", [
     ("a=1", 1), ("a=-0.5", -0.5), ("a=1e-3", 1e-3), ("a=inf", float("inf")), ("a=true", True), ("a=False", False),
-    ("a=0.7,inf", [0.7, float("inf")]), ("a=[1, 2]", [1, 2]), ("a=[[0,-1.3], [1, inf]]", [[0, -1.3], [1, float("inf")]]),
-    ("a=[[1,2]]", [[1, 2]]),
+    ("a=0.7,inf", [0.7, float("inf")]), ("a=[1, 2]", [1, 2]),
+    ("a=[[0,-1.3], [1, inf]]", [[0, -1.3], [1, float("inf")]]), ("a=[[1,2]]", [[1, 2]]),
 ])  # fmt: skip
 def test_parameter_values_are_parsed_by_their_type(text: str, value: object) -> None:
     name, parsed = parameter(text)
