@@ -7,6 +7,7 @@ import runpy
 import shlex
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from conftest import TaskFile
@@ -105,6 +106,7 @@ class Walkthrough:
         monkeypatch.syspath_prepend(folder)
 
     def run(self, page: Path) -> None:
+        names: dict[str, Any] = {}
         for i, (language, title, text) in enumerate(BLOCK.findall(page.read_text())):
             if title:
                 (self.folder / title).write_text(text)
@@ -114,7 +116,7 @@ class Walkthrough:
             elif language == "python":
                 script = self.folder / f"block_{i}.py"
                 script.write_text(text)
-                runpy.run_path(str(script), run_name=f"block_{i}")
+                names = runpy.run_path(str(script), init_globals=names, run_name=f"block_{i}")
 
     def command(self, command_line: list[str]) -> None:
         match command_line:
