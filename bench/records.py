@@ -71,10 +71,9 @@ TWO_SUBSTEPS = ("--integrator", "discrete", "--frame-skip", "2", "--timestep", "
 WIDE_EXPLORATION = (
     "--param", "track_angular_velocity=4", "--desired-kl", "0.04", "--log-std", "0", "--gate-every", "48",
     "--final-entropy-coef", "0.001", "--entropy-decay", "200", "400", "--param", "stages=[[0,-1.3,1.3,1]]",
-    "--param", "fall=-100",
 )  # fmt: skip
 """Exploration that ends the time in which a T1 only stands, and then decreases, so that the robot walks precisely. It
-falls mostly at 1 m/s, so that it also learns from larger commands, and each fall has a cost."""
+falls mostly at 1 m/s, so that it also learns from larger commands."""
 STRONG_TRACKING_GAIT = (
     "--param", "track_linear_velocity=10", "--param", "track_angular_velocity=5", "--param", "gait_clock=8",
     "--param", "roll_pitch_rate_l2=-0.4", "--param", "growth_steps=50000",

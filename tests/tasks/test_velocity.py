@@ -90,15 +90,3 @@ def test_servos_reach_the_forces_of_their_motors_in_the_initial_pose(task: str, 
         mujoco.mj_forward(model, data)
         force = sign * data.qfrc_actuator[model.jnt_dofadr[joints]]
         np.testing.assert_allclose(force, np.minimum(of_joints, of_servos), rtol=1e-6)
-
-
-@pytest.mark.parametrize("task", ["h1_velocity"])
-def test_fall_costs_once_when_it_ends_the_episode(task: str, env: lw.Env) -> None:
-    env.rand_reset(0)
-    state = env.get_state()
-    env.state_space.split(state)["qpos"][0, 3:7] = torch.tensor([0.5, 0.5, 0.5, 0.5])
-    env.set_state(state)
-    env.set_params(fall=-200.0)
-    env.step(torch.zeros_like(env.action))
-    env.set_params(fall=0.0)
-    assert env.metrics["fall"].tolist() == [-4.0] + 15 * [0.0] and env.terminated.tolist() == [True] + 15 * [False]
