@@ -260,7 +260,7 @@ def timed(
 
     Return the entry "reached" of config.json, or None after the limit, and the seconds.
     """
-    began, reached = time.perf_counter(), None
+    began, reached, stopped = time.perf_counter(), None, False
     process = run(command, environment)
     config = folder / "config.json"
     while True:
@@ -272,12 +272,14 @@ def timed(
         if reached is not None:
             process.wait()  # the process saves the policy and evaluates it
             return reached, seconds
+        if stopped:
+            return None, seconds
         if code is not None:
             raise RuntimeError(f"{' '.join(command)} ended with code {code} before it reached the target")
         if seconds > limit:
             process.send_signal(signal.SIGTERM)  # the process saves the run after the current iteration
             process.wait()
-            return None, time.perf_counter() - began
+            stopped = True  # but it may have passed in this iteration
         time.sleep(0.05)
 
 
